@@ -15,13 +15,12 @@ from sysid.engine.structure import Structure
 from sysid.problem.model import ProcessModel
 
 _STAGES = {"a": "0.0", "b": "0.5", "c": "1.0"}  # and how much of a step has passed
-# ||J^16||^(1/16) is an upper bound of the spectral radius that is tight to a few per cent.
-_SQUARINGS = 4
 EACH_LANE = f"for l in range({LANES}):"
 
 
 class BatchKernel(Scheme):
-    """Text of the batch kernels; needs math, np, scheme_matrices, wide_vectors and the program.
+    """Text of the batch kernels; needs math, np, wide_vectors, the program and what
+    is compiled once for all models, ``scheme_matrices`` and ``fastest_rate``.
 
     ``simulate`` runs lanes of chromosomes over a record, ``spectrum`` bounds the fastest rate
     of what is not integrated exactly. The work area holds rows of lanes: states, constants, sums
@@ -182,7 +181,7 @@ class BatchKernel(Scheme):
             *[f"X[{i}] = x[k, {i}, l]" for i in range(self.n_states)],
             *block(f"if not ({finite}):", ["continue"]),
             *self._jacobian(),
-            *_RADIUS.splitlines(),
+            "rate[l] = max(rate[l], fastest_rate(J, T))",
         ]
         lane = [
             f"c = constants({listed(f'p[{i}, l]' for i in range(self.n_parameters))})",
@@ -190,10 +189,8 @@ class BatchKernel(Scheme):
             *block("for k in range(u.shape[0]):", at_sample),
         ]
         body = [
-            # Not a literal: the compiler would unroll the matrix products for seconds.
-            f"n = min(x.shape[1], {n})",
-            "J = np.empty((n, n))",
-            "T = np.empty((n, n))",
+            f"J = np.empty(({n}, {n}))",
+            f"T = np.empty(({n}, {n}))",
             f"X = np.empty({self.n_states})",
             f"N = np.empty({n})",
             *block("for l in range(rate.shape[0]):", lane),
@@ -268,36 +265,3 @@ def _paired(lines: list[str]) -> list[str]:
         return renamed.replace("+ l]", second)
 
     return [twin for line in lines for twin in (line, moved(line))]
-
-
-# Raises lane l's rate to a bound on the spectral radius of J, by repeated squaring.
-_RADIUS = f"""\
-exponent = 0.0
-for squaring in range({_SQUARINGS + 1}):
-    norm = 0.0
-    for i in range(n):
-        for j in range(n):
-            norm += J[i, j] * J[i, j]
-    norm = math.sqrt(norm)
-    if norm == 0.0:
-        exponent = -math.inf
-        break
-    if not math.isfinite(norm):
-        exponent = math.inf
-        break
-    exponent += math.log(norm) / 2.0 ** squaring
-    if squaring == {_SQUARINGS}:
-        break
-    for i in range(n):
-        for j in range(n):
-            J[i, j] /= norm
-    for i in range(n):
-        for j in range(n):
-            t = 0.0
-            for q in range(n):
-                t += J[i, q] * J[q, j]
-            T[i, j] = t
-    for i in range(n):
-        for j in range(n):
-            J[i, j] = T[i, j]
-rate[l] = max(rate[l], math.exp(exponent))"""

@@ -160,13 +160,15 @@ def _compiled(
     # Numba is slow to import.
     from sysid.engine import intrinsics, vector_math
     from sysid.engine.phi import scheme_matrices
+    from sysid.engine.rate import fastest_rate
 
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
     scope = {
         "np": np,
         "math": vector_math,
         **{name: getattr(vector_math, name) for name in vector_math.OF_SLOPES},
-        "scheme_matrices": scheme_matrices,
+        "scheme_matrices": intrinsics.outside(scheme_matrices),
+        "fastest_rate": intrinsics.outside(fastest_rate),
         "wide_vectors": intrinsics.wide_vectors,
         "always_inline": intrinsics.always_inline,
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
@@ -287,7 +289,7 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
     import numba
 
     key = hashlib.sha256(f"{numba.__version__}\n{sorted(_OPTIONS['fastmath'])}\n{text}".encode())
-    for library in ("intrinsics.py", "phi.py", "straight_line.py", "vector_math.py"):
+    for library in ("intrinsics.py", "phi.py", "rate.py", "straight_line.py", "vector_math.py"):
         key.update(Path(__file__).with_name(library).read_bytes())
     for function in called.values():
         _fingerprint(function, key, set())

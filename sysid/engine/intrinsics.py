@@ -1,11 +1,15 @@
 # mypy: ignore-errors
 """What compiled code needs and Python has no words for."""
 
+import contextlib
+import inspect
 import platform
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import binding, ir
-from numba import types
+from numba import njit, types
+from numba.core import cgutils
 from numba.core.extending import intrinsic as _intrinsic
 
 from sysid.engine.scheme import LANES
@@ -80,3 +84,48 @@ def multiply_add(context: Any, c: Any, k: Any, a: Any, i: Any, b: Any, j: Any) -
         return context.get_dummy_value()
 
     return types.none(c, types.intp, a, types.intp, b, types.intp), generate
+
+
+def shared(signature: str) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function once for all models, for one signature; kernels call it by ``outside``."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        # RuntimeError: there is no place to keep it.
+        with contextlib.suppress(RuntimeError):
+            return njit(signature, error_model="numpy", cache=True)(function)
+        return njit(signature, error_model="numpy")(function)
+
+    return compiled
+
+
+def outside(dispatcher: Any) -> Any:
+    """An intrinsic that calls a function of one signature by its address.
+
+    What calls it as it is has all of its code optimised and translated again, as a part of its own.
+    """
+    (compiled,) = dispatcher.overloads.values()
+    signature, name = compiled.signature, f"hybrid_rig_{dispatcher.__name__}"
+    # Also machine code that comes from the cache finds it by this name.
+    address = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
+    binding.add_symbol(name, address)
+
+    def call(context: Any, *arguments: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            convention = context.call_conv
+            kind = convention.get_function_type(signature.return_type, signature.args)
+            callee = cgutils.get_or_insert_function(builder.module, kind, name)
+            status, result = convention.call_function(
+                builder, callee, signature.return_type, signature.args, args
+            )
+            with cgutils.if_unlikely(builder, status.is_error):
+                convention.return_status_propagate(builder, status)
+            return result
+
+        return signature, generate
+
+    # Arguments by their names: what stands behind a star would come as one tuple.
+    names = inspect.signature(dispatcher.py_func).parameters
+    first = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    parameters = [inspect.Parameter(p, first.kind) for p in names]
+    call.__signature__ = inspect.Signature([first, *parameters])
+    return intrinsic(call)

@@ -9,28 +9,19 @@ Only entries that can differ from zero are kept: a matrix is an array (entries, 
 doubles as often as its own norm asks for, so that what it gets does not depend on the others.
 """
 
-import contextlib
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numba import njit
 
 from sysid.arrays import FloatArray, IntArray
-from sysid.engine.intrinsics import from_bits, multiply_add, to_bits, wide_vectors
+from sysid.engine.intrinsics import from_bits, multiply_add, shared, to_bits, wide_vectors
 from sysid.engine.scheme import LANES, work_area
 
 _SMALL = 0.5  # norm at which the series takes over
 _TERMS = 10  # leaves 0.5^10/13! = 2e-13
 _HUGE = 1e18  # a norm at which nothing sensible is left
-
-
-def _kept(function: Callable[..., None]) -> Any:
-    """Compile once for all models, where there is a place to keep what is compiled."""
-    with contextlib.suppress(RuntimeError):
-        return njit(error_model="numpy", cache=True)(function)
-    return njit(error_model="numpy")(function)
 
 
 @njit(error_model="numpy")
@@ -136,7 +127,7 @@ def _add(p: FloatArray, entries: IntArray, value: float) -> None:
 _aligned: Any = njit(work_area)
 
 
-@_kept
+@shared("void(f8[:, ::1], f8[::1], i8[:, ::1], i8[:, ::1], i8[:, ::1], f8[:, ::1])")
 def scheme_matrices(  # noqa: PLR0912  (a function's call copies its arrays' descriptions)
     a: FloatArray,
     h: FloatArray,

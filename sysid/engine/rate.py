@@ -1,0 +1,42 @@
+"""The fastest rate of equations, compiled once for all models."""
+
+import math
+
+from sysid.arrays import FloatArray
+from sysid.engine.intrinsics import shared
+
+_SQUARINGS = 4
+
+
+@shared("f8(f8[:, ::1], f8[:, ::1])")
+def fastest_rate(J: FloatArray, T: FloatArray) -> float:
+    """||J^16||^(1/16), a bound on J's spectral radius that is tight to a few per cent.
+
+    J: (n, n), overwritten; T: (n, n), to work in. Infinite for a J that is not finite.
+    """
+    n = len(J)
+    exponent = 0.0
+    for squaring in range(_SQUARINGS + 1):
+        norm = 0.0
+        for i in range(n):
+            for j in range(n):
+                norm += J[i, j] * J[i, j]
+        norm = math.sqrt(norm)
+        if norm == 0.0:
+            return 0.0
+        if not math.isfinite(norm):
+            return math.inf
+        exponent += math.log(norm) / 2.0**squaring
+        if squaring == _SQUARINGS:
+            break
+        for i in range(n):
+            for j in range(n):
+                J[i, j] /= norm
+        for i in range(n):
+            for j in range(n):
+                t = 0.0
+                for q in range(n):
+                    t += J[i, q] * J[q, j]
+                T[i, j] = t
+        J, T = T, J
+    return math.exp(exponent)
