@@ -9,7 +9,7 @@ import threading
 from collections.abc import Sequence
 from types import FrameType
 
-from daq.errors import RigError, Terminated
+from daq.errors import Mistake, RigError, Terminated
 
 _INTERRUPTED = 130  # what Typer makes of Ctrl-C
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # where there is such a signal
@@ -102,15 +102,18 @@ def _is_stopped(end: BaseException | None) -> bool:
 
 def _report(error: BaseException, message: str, status: int = 1) -> int:
     """Say a message, behind the notes of the error and of those that led to it."""
-    from daq.cli.terminal import report_error
+    from daq.cli.terminal import print_json_error, report_error
 
-    lines: list[str] = []
+    notes: list[str] = []
     cause: BaseException | None = error
     while cause is not None:
-        lines += getattr(cause, "__notes__", ())
+        notes += getattr(cause, "__notes__", ())
         cause = cause.__context__
+    mistakes = error.mistakes if isinstance(error, RigError) else (Mistake(message),)
+    with contextlib.suppress(OSError):  # its reader is gone
+        print_json_error(mistakes, notes, status)
     with contextlib.suppress(OSError):  # its terminal is gone
-        for line in (*lines, message):
+        for line in (*notes, message):
             report_error(line)
     return status
 

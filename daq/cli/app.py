@@ -5,7 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from inspect import Parameter, cleandoc, signature
 from typing import Annotated, Any, Literal
 
@@ -34,7 +34,7 @@ from daq.cli.schema import schema
 from daq.cli.scope import scope
 from daq.cli.terminal import Volume, output
 from daq.cli.tune import tune
-from daq.errors import ConfigError, RigError
+from daq.errors import ConfigError
 
 _COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (run, "rig run prbs.yaml --identify"),
@@ -89,13 +89,8 @@ def _with_volume(function: Callable[..., None]) -> Callable[..., None]:
             raise BadParameter("give --quiet or --verbose, not both")
         level = Volume.QUIET if quiet else Volume.VERBOSE if verbose else Volume.NORMAL
         with output(level, options.get("json", False)), _interruptible(function):
-            try:
-                _secure_cache()
-                function(*args, **options)
-            except RigError as error:
-                with suppress(OSError):  # its reader is gone; what went wrong comes first
-                    terminal.print_json_error(error)
-                raise
+            _secure_cache()
+            function(*args, **options)
 
     # Typer reads the options from the signature and the annotations.
     plain = signature(function, eval_str=True)
@@ -128,11 +123,10 @@ class _Commands(TyperGroup):
     """The commands; with ``--json`` a mistake in the command line is a document as well."""
 
     def invoke(self, ctx: Any) -> Any:
-        json = "--json" in ctx.args
         try:
             return super().invoke(ctx)
         except Exception as error:
-            if json and hasattr(error, "format_message"):  # all that Typer's mistakes share
+            if hasattr(error, "format_message"):  # all that Typer's mistakes share
                 terminal.print_json_usage_error(error)
             raise
 

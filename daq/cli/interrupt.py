@@ -5,10 +5,12 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from contextvars import copy_context
 from types import FrameType
 
-from daq.cli.terminal import report_error
+from daq.cli.terminal import print_json_error, report_error
+from daq.errors import Mistake
 
 _GRACE = 5.0  # s; code that comes to an end does so within much less
 _STUCK = "stopped by Ctrl-C, in compiled equations that have no end; give every loop in them one"
@@ -37,6 +39,8 @@ def heeded() -> Iterator[None]:
         # The bytes are written by the operating system's handler, whatever the main thread does.
         while numbers := reader.recv(16):
             if signal.SIGINT in numbers and not in_python.wait(_GRACE):
+                with suppress(OSError):  # its reader is gone
+                    print_json_error([Mistake(_STUCK)], [], 1)
                 report_error(_STUCK)
                 os._exit(1)
             in_python.clear()
@@ -44,7 +48,8 @@ def heeded() -> Iterator[None]:
 
     signal.signal(signal.SIGINT, handle)
     wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=watch, name="ctrl-c", daemon=True).start()
+    run = copy_context().run  # knows where documents go
+    threading.Thread(target=run, args=[watch], name="ctrl-c", daemon=True).start()
     try:
         yield
     finally:

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 from daq import notation
 from daq.documents import plain
-from daq.errors import RigError
+from daq.errors import Mistake
 from daq.progress import Event, Level, Note, Progress, Watch, ignore
 
 number = notation.number  # pages and tables print numbers alike
@@ -124,9 +124,12 @@ def print_json(document: Any) -> None:
     out.flush()
 
 
-def print_json_error(error: RigError) -> None:
-    """The document of a command that failed, where it has not printed its own."""
-    if _documents.get() is None or _has_document.get():
+def print_json_error(mistakes: Iterable[Mistake], notes: Sequence[str], status: int) -> None:
+    """The document of a command that failed, where one is asked for and it has printed none.
+
+    Looked for among the words typed: a signal may end the command before they are understood.
+    """
+    if "--json" not in sys.argv or _has_document.get():
         return
     errors = [
         {
@@ -137,24 +140,18 @@ def print_json_error(error: RigError) -> None:
             "key": mistake.key or None,
             "cure": mistake.cure or None,
         }
-        for mistake in error.mistakes
+        for mistake in mistakes
     ]
-    notes = getattr(error, "__notes__", [])
-    print_json({"exit_status": error.exit_status, "errors": errors, "notes": notes})
+    print_json({"exit_status": status, "errors": errors, "notes": notes})
 
 
 def print_json_usage_error(error: Any) -> None:
     """The document of a command line that makes no sense; error: of Typer's, with its message."""
     parameter, context = getattr(error, "param", None), getattr(error, "ctx", None)
-    mistake = {
-        "error": error.format_message(),
-        "file": None,
-        "line": None,
-        "column": None,
-        "key": getattr(error, "option_name", None) or getattr(parameter, "name", None),
-        "cure": None if context is None else f"see {context.command_path} --help",
-    }
-    print_json({"exit_status": error.exit_code, "errors": [mistake], "notes": []})
+    key = getattr(error, "option_name", None) or getattr(parameter, "name", None)
+    cure = "" if context is None else f"see {context.command_path} --help"
+    mistake = Mistake(error.format_message(), cure, key=key or "")
+    print_json_error([mistake], [], error.exit_code)
 
 
 def print_text(text: str) -> None:

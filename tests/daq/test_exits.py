@@ -257,6 +257,14 @@ def assert_consistent(folder, status, reason):
             assert len(loaded.frame) == len(rows) - 1
 
 
+def assert_is_document(result):
+    """Standard output is the document of what is said on standard error."""
+    document = json.loads(result.stdout)
+    assert document["exit_status"] == result.returncode
+    said = [*document["notes"], *(error["error"] for error in document["errors"])]
+    assert document["errors"] and all(text in result.stderr for text in said)
+
+
 # One of every fault and every phase runs always; all with -m soak.
 ALWAYS = {
     "unplugged in open", "bug in open", "SIGHUP in calibration", "interlock in calibration",
@@ -287,9 +295,10 @@ def test_outputs_are_zero_and_the_record_says_why(run, tmp_path, exit):
     write_rig(
         tmp_path / "rig.yaml", backend="bad", options={"phase": exit.phase, "fault": exit.fault}
     )
-    result = run(["run", "e.yaml", "--rig", "rig.yaml"], tmp_path)
+    result = run(["run", "e.yaml", "--rig", "rig.yaml", "--json"], tmp_path)
     assert result.returncode == 1, result.stderr
     assert "Traceback" not in result.stderr
+    assert_is_document(result)
     assert_left_safe(tmp_path)
     assert_consistent(only_capture(tmp_path), exit.status, exit.reason)
 
@@ -379,9 +388,10 @@ def test_ctrl_c_while_the_program_is_still_being_imported_is_no_traceback():
         "main()\n"
     )
     result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+        [sys.executable, "-c", code, "ports", "--json"], capture_output=True, text=True, check=False
     )
     assert result.returncode == 1
+    assert_is_document(result)
     assert result.stderr.strip() == "rig: stopped by Ctrl-C"
 
 
