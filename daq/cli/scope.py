@@ -39,7 +39,8 @@ def scope(
             shown = {"run": named[0] if named else None, "behind": named[1:]}
             terminal.print_json({"address": address, **shown, "out": out})
         else:
-            what = " over ".join(map(str, named)) or f"the newest run under {out}"
+            missing = "" if out.is_dir() else ", a folder that is not there yet"
+            what = " over ".join(map(str, named)) or f"the newest run under {out}{missing}"
             print(f"{address} shows {what}; Ctrl-C ends it")
         sys.stdout.flush()
         if browser and not json and not webbrowser.open(address):

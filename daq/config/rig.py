@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, ValidationInfo, create_model, field_validator
@@ -17,16 +18,19 @@ from daq.config.units import (
     Unit,
     Volts,
 )
-from daq.errors import ConfigError
+from daq.errors import ConfigError, Mistake
 
 Sign = Literal[-1, 1]
 Realtime = Literal["off", "prefer", "require"]
 VoltsPerSecond = Annotated[float, Unit("V/s")]
 AmperesPerVolt = Annotated[float, Unit("A/V")]
+Position = Annotated[Turns, Field(ge=-1e4, le=1e4)]
 SquaredCurrentTime = Annotated[float, Unit("A^2*s")]
 
 _SLOW = 0.1  # of the speed limit, up to which the motor's back EMF leaves its amplifier voltage
 _FASTEST = 100.0  # rad/s, taken where there is no such limit
+_INPUT = 10.0  # V, where an analog input ends at the latest
+_UNLOADED = 2.0  # times the speed with half of the current: where none is left, at most
 COUNT_GRAIN = 2.0  # counts by which a change of the encoder's may be larger than the shaft's
 
 
@@ -159,7 +163,10 @@ class EncoderLimits(Section):
     """What an encoder that works cannot show."""
 
     fastest: RadiansPerSecond = Field(
-        1000.0, gt=0.0, description="change of the angle from sample to sample that is a jump"
+        1000.0,
+        gt=0.0,
+        le=1e4,
+        description="change of the angle from sample to sample that is a jump",
     )
     silent: Turns = Field(
         0.25, gt=0.0, description="turns by which count and speed estimate may come to differ"
@@ -203,9 +210,13 @@ class LimitSettings(Section):
     slew: SlewLimits = Field(SlewLimits(), description="how fast the commands may change")
     current: CurrentLimits = Field(CurrentLimits(), description="current interlocks")
     i2t: OverloadLimits = Field(OverloadLimits(), description="heat of the windings")
-    speed: RadiansPerSecond | None = Field(None, gt=0.0, description="fastest shaft, either way")
-    torque: NewtonMetres | None = Field(None, gt=0.0, description="largest torque, either way")
-    travel: tuple[Turns, Turns] | None = Field(
+    speed: RadiansPerSecond | None = Field(
+        None, gt=0.0, le=1e4, description="fastest shaft, either way"
+    )
+    torque: NewtonMetres | None = Field(
+        None, gt=0.0, le=1e3, description="largest torque, either way"
+    )
+    travel: tuple[Position, Position] | None = Field(
         None, description="lowest and highest angle, from where the shaft stood at the beginning"
     )
     winding: Turns | None = Field(
@@ -292,6 +303,34 @@ class RigConfig(Section):
         """Speed [rad/s] up to which the motor's amplifier gives nearly all of what is asked."""
         speed = _SLOW * (self.limits.speed or _FASTEST)
         return min(speed, self.amplifiers.speed or speed)
+
+    @property
+    def idle_limits(self) -> list[Mistake]:
+        """Limits that nothing which the rig's file describes can pass, and so protect nothing."""
+        limits, sensors = self.limits, self.sensors
+        mistakes = []
+        for key, limit, sensor, unit in (
+            ("current.motor", limits.current.motor, "current_motor", "A"),
+            ("current.brake", limits.current.brake, "current_brake", "A"),
+            ("torque", limits.torque, "torque", "N*m"),
+        ):
+            most = _INPUT * getattr(sensors, sensor).scale
+            if limit is not None and limit > most:
+                problem = (
+                    f"{limit:g} {unit} is never measured: inputs end at {_INPUT:g} V, which is "
+                    f"{most:.4g} {unit} by sensors.{sensor}.scale"
+                )
+                mistakes.append(Mistake(problem, "write less, or the right scale", key=key))
+        speeds = {"limits.encoder.fastest, beyond which the angle jumps": limits.encoder.fastest}
+        if self.amplifiers.speed is not None:
+            speeds["twice amplifiers.speed, where the motor's supply ends"] = (
+                _UNLOADED * self.amplifiers.speed
+            )
+        name, fastest = min(speeds.items(), key=itemgetter(1))
+        if limits.speed is not None and limits.speed > fastest:
+            problem = f"{limits.speed:g} rad/s is beyond {fastest:g} rad/s, {name}"
+            mistakes.append(Mistake(problem, "write what rig and hand bear", key="speed"))
+        return mistakes
 
     @field_validator("realtime", mode="before")
     @classmethod

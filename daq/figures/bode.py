@@ -12,8 +12,7 @@ from daq.figures import style
 from daq.hal import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
-ESTIMATED = "identified"  # of the curves: by the same estimate as the measured points
-_MEASURED = "measured, 95 %"
+_MEASURED, _IDENTIFIED = "measured, 95 %", "identified"
 _Z95 = 1.959963984540054
 _SEEN = 0.3  # coherence below which a measured point is drawn faintly
 
@@ -24,23 +23,29 @@ def bode(
     response: ComplexArray,
     coherence: FloatArray,
     deviation: FloatArray,
-    curves: Mapping[str, ComplexArray],
+    identified: ComplexArray | None,
+    band: FloatArray,
+    linear: Mapping[str, ComplexArray],
     units: tuple[str, str],
 ) -> Figure:
     """Magnitude, phase and coherence over frequencies [Hz], (n,).
 
     response, coherence, deviation: as estimated, (n,), with a magnitude's standard deviation.
-    curves: responses at the same frequencies by name. units: of output and input. Measured
-    magnitudes carry 95 % bars; points of low coherence are faint, and what was estimated from the
-    logs with the same inputs (``ESTIMATED``) has gaps there. Phases do not jump by a
-    turn where there is a linear model to go by.
+    identified: of the model, by the same estimate. linear: of linear models by name, at the
+    frequencies ``band`` [Hz], (m,). units: of output and input. Measured magnitudes carry 95 %
+    bars; points of low coherence are faint, and what is identified has gaps there. Phases do not
+    jump by a turn where there is a linear model to go by.
     """
+    estimates = {} if identified is None else {_IDENTIFIED: identified}
+    names = [*estimates, *linear]
     figure, (size, angle, seen) = style.stack(
-        [1.1, 0.8, 0.45], 0.1, top=style.legend_room([_MEASURED, *curves])
+        [1.1, 0.8, 0.45], 0.1, top=style.legend_room([_MEASURED, *names])
     )
     magnitude = np.abs(response)
     good = coherence >= _SEEN
-    phases = _phases([response, *curves.values()], any(name != ESTIMATED for name in curves))
+    visible = good if good.any() else np.ones(len(good), dtype=bool)
+    smooth = _smooth_phase(linear)
+    phase = _phase(response, frequency, band, smooth)
     for chosen, colour in ((~good, style.FAINT), (good, style.MEASURED)):
         if not chosen.any():
             continue
@@ -52,18 +57,19 @@ def bode(
         )  # fmt: skip
         size.plot(frequency[chosen], magnitude[chosen], ".", ms=2.5, color=colour,
                   label=_MEASURED if colour == style.MEASURED else None)  # fmt: skip
-        angle.plot(frequency[chosen], phases[0][chosen], ".", ms=2.5, color=colour)
-    for k, (name, curve) in enumerate(curves.items()):
-        seen_there = good if name == ESTIMATED and good.any() else np.ones(len(good), dtype=bool)
+        angle.plot(frequency[chosen], phase[chosen], ".", ms=2.5, color=colour)
+    phases = [phase[good]]
+    drawn = [(frequency, np.where(visible, each, np.nan)) for each in estimates.values()]
+    drawn += [(band, each) for each in linear.values()]
+    for k, (name, (at, curve)) in enumerate(zip(names, drawn, strict=True)):
         look = {"color": style.CYCLE[(1, 0, 2, 3)[k % 4]], "ls": style.DASHES[k % 4]}
-        height = np.where(seen_there, np.abs(curve), np.nan)
-        size.plot(frequency, height, label=name, **look)  # type: ignore[arg-type]
-        turned = np.where(seen_there, phases[1 + k], np.nan)
-        angle.plot(frequency, turned, **look)  # type: ignore[arg-type]
-    limits = _limits(magnitude, good, curves)
+        size.plot(at, np.abs(curve), label=name, **look)  # type: ignore[arg-type]
+        phases.append(_phase(curve, at, band, smooth))
+        angle.plot(at, phases[-1], **look)  # type: ignore[arg-type]
+    limits = _limits(magnitude, good, [*estimates.values(), *linear.values()])
     size.set_ylim(*limits)
     style.logarithmic(size.yaxis, np.array(limits))
-    shown = np.concatenate([phases[0][good], *phases[1:]])
+    shown = np.concatenate(phases)
     _limit_phase(angle, shown[np.isfinite(shown)])
     seen.plot(frequency, coherence, color=style.MEASURED, lw=0.8)
     seen.set_ylim(-0.05, 1.05)
@@ -76,13 +82,21 @@ def bode(
     return figure
 
 
-def _phases(responses: Sequence[ComplexArray], go_on: bool) -> list[FloatArray]:
-    """Phases [degrees]; go_on: the last does not jump by a turn, and the others keep near it."""
-    phases = [np.angle(np.nan_to_num(response), deg=True) for response in responses]
-    if not go_on:
-        return phases
-    smooth = np.unwrap(phases[-1], period=360.0)
-    return [each + 360.0 * np.round((smooth - each) / 360.0) for each in phases]
+def _smooth_phase(linear: Mapping[str, ComplexArray]) -> FloatArray | None:
+    """Phase [degrees] of the last linear model, without jumps by a turn; None without one."""
+    *_, last = [None, *linear.values()]
+    return None if last is None else np.unwrap(np.angle(last, deg=True), period=360.0)
+
+
+def _phase(
+    response: ComplexArray, frequency: FloatArray, band: FloatArray, smooth: FloatArray | None
+) -> FloatArray:
+    """Phase [degrees], of the turns that one may choose from that which is near the smooth one."""
+    phase: FloatArray = np.angle(response, deg=True)
+    if smooth is None:
+        return phase
+    near = np.interp(frequency, band, smooth)
+    return phase + 360.0 * np.round((near - phase) / 360.0)
 
 
 def _limit_phase(angle: Axes, degrees: FloatArray) -> None:
@@ -95,11 +109,11 @@ def _limit_phase(angle: Axes, degrees: FloatArray) -> None:
 
 
 def _limits(
-    magnitude: FloatArray, good: npt.NDArray[np.bool_], curves: Mapping[str, ComplexArray]
+    magnitude: FloatArray, good: npt.NDArray[np.bool_], curves: Sequence[ComplexArray]
 ) -> tuple[float, float]:
     """Limits by what is credible: neither bars that reach to zero nor a curve's notch."""
     credible = magnitude[good] if good.any() else magnitude
-    middles = [float(np.median(np.abs(values))) for values in curves.values()]
+    middles = [float(np.median(np.abs(values))) for values in curves]
     every = np.concatenate([credible[credible > 0.0], [m for m in middles if m > 0.0]])
     if not len(every):
         return 0.1, 1.0

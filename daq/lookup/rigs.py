@@ -49,6 +49,9 @@ def load_rig(
     for index, limit in enumerate(config.limits.own):
         limit._make = _limit_maker(file, limit, ("limits", "own", index))
     config = _with_fitting_limits(config, watch)
+    for idle in config.idle_limits:
+        place = file.mistake(("limits", *idle.key.split(".")), "")
+        watch(Note("warning", replace(idle, key="").behind(place).text))
     device: Device = backend(config.options)
     return config, device
 

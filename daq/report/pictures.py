@@ -43,6 +43,7 @@ _MOTIONS = {"N": ("m", "m/s"), "N*m": ("rad", "rad/s")}  # that a force or torqu
 _OUTPUTS_A_FIGURE = 4
 _DRAWS = 24  # of the parameters, for bands
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
+_FINE = 400  # frequencies over the band at which linear models are drawn
 _COHERENT = 0.5  # coherence above which an input is seen in an output
 _FEWEST_COHERENT = 4  # frequencies at which it must be, for a Bode plot
 
@@ -286,7 +287,11 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         f"{measured.n_segments} segments.",
         spectra(measured.frequency, densities, {signal.name: signal.unit for signal in inputs}),
     )  # fmt: skip
-    curves, lacking = _model_responses(subject, measured.frequency)
+    identified = _estimated_response(subject)
+    band = np.union1d(
+        np.geomspace(measured.frequency[0], measured.frequency[-1], _FINE), measured.frequency
+    )
+    linear, lacking = _linear_responses(subject, band)
     for j, i in _pairs(measured):
         output, given = subject.model.outputs[j], inputs[i]
         yield Picture(
@@ -296,28 +301,32 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
             bode(
                 measured.frequency, measured.response[:, j, i], measured.coherence[:, j, i],
                 measured.deviation[:, j, i] / np.sqrt(2.0),
-                {name: response[:, j, i] for name, response in curves.items()},
+                None if identified is None else identified[:, j, i],
+                band,
+                {name: response[:, j, i] for name, response in linear.items()},
                 (output.unit, given.unit),
             ),
         )  # fmt: skip
 
 
-def _model_responses(
+def _estimated_response(subject: Subject) -> ComplexArray | None:
+    """Of the identified model, from its free runs like the logs'; None where one diverges."""
+    runs = [run for _, run in (*subject.training, *subject.validation)]
+    if not all(np.isfinite(run).all() for run in runs):
+        return None
+    simulated = [
+        replace(record, outputs=np.where(np.isfinite(record.outputs), run, np.nan))
+        for record, run in zip(subject.records, runs, strict=True)
+    ]
+    return frequency_response(simulated).response
+
+
+def _linear_responses(
     subject: Subject, frequency: FloatArray
 ) -> tuple[dict[str, ComplexArray], str]:
-    """Of the identified model: estimated from its free runs like the logs', and linearised.
-
-    Also a sentence on operating points that have no linear model, or none.
-    """
+    """Of the identified model linearised, by operating point; what has none, in a sentence."""
     model, records = subject.model, subject.records
-    runs = [run for _, run in (*subject.training, *subject.validation)]
     curves = {}
-    if all(np.isfinite(run).all() for run in runs):
-        simulated = [
-            replace(record, outputs=np.where(np.isfinite(record.outputs), run, np.nan))
-            for record, run in zip(records, runs, strict=True)
-        ]
-        curves["identified"] = frequency_response(simulated).response
     u = np.concatenate([record.inputs for record in records]).mean(axis=0)
     points = _by_model(model, model.operating_points, records) if model.operating_points else {}
     lacking = []

@@ -32,6 +32,14 @@ class EarlierRun:
         self._drawn: tuple[float, float] | None = None
         self._rows = 0
 
+    @property
+    def text(self) -> str:
+        """Its name, and how long it is: it may have ended before what is shown."""
+        history = self.log.history
+        if history is None or not history.n_rows:
+            return f"{self.log.name}, without a sample"
+        return f"{self.log.name}, {history.span[1]:.5g} s"
+
     def draw(self, start: float, end: float) -> bool:
         """Draw what lies between two times [s], where that is not drawn yet; whether it was not."""
         self.log.read()

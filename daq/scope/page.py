@@ -94,6 +94,7 @@ class Page:
         controls = row(self._button, self._window, self._view, self._stop, styles=_WRAPPED)
         more = row(*self._trigger.parts, self._behind, styles=_WRAPPED)
         self._side = column(name="side")
+        self._help = Div(text=HELP, width=380, styles={"color": GREY})
         body = row(self._figures, self._side, sizing_mode="stretch_width", styles=_WRAPPED)
         parts = (self._head, controls, more, self._channels, body)
         page = column(*parts, sizing_mode="stretch_width")
@@ -159,7 +160,7 @@ class Page:
             return
         trigger = self._trigger.trigger
         if self._live and trigger is not None:
-            self._draw_triggered(trigger, history)
+            self._draw_triggered(trigger, history, ended=not log.state.running)
         elif self._live:
             self._draw_live(log, history)
         elif self._zoomed_to is not None:
@@ -177,10 +178,10 @@ class Page:
         """The stretch of time that is shown [s]."""
         return cast("float", self._time.start), cast("float", self._time.end)
 
-    def _draw_triggered(self, trigger: Trigger, history: History) -> None:
+    def _draw_triggered(self, trigger: Trigger, history: History, ended: bool) -> None:
         """Draw what is around the newest passage of the trigger, once it is there."""
         width = list(_WINDOWS.values())[self._window.active or 0] or math.inf
-        if not trigger.look(history, self._columns, width):
+        if not trigger.look(history, self._columns, width, ended):
             return
         assert trigger.at is not None
         start = trigger.at - BEFORE * width
@@ -252,8 +253,8 @@ class Page:
         names = [quantity_of(group[-1]) for group in groups_of(columns)]
         names += [figures.FLAGS] * (figures.FLAGS in columns)
         self._clear()
-        words = Div(text=HELP, width=380, styles={"color": GREY})
-        self._side.children = [figures.make_value_table(self._values, len(columns) + 1), words]
+        table = figures.make_value_table(self._values, len(columns) + 1)
+        self._side.children = [table, self._help]
         channels = [group[-1] for group in groups_of(columns)]
         self._trigger.offer(channels)
         self._channels.labels, everything = names, list(range(len(names)))
@@ -272,6 +273,7 @@ class Page:
         if not self._columns:
             return
         self._make_overlays()
+        self._help.visible = view == TIME
         if view != TIME:
             others = [run.planes for run in self._overlays]
             layout = self._planes.layout(view, self._columns, self._chosen, others)
@@ -355,7 +357,7 @@ class Page:
         self._show_stop()
         newer = self._log is not self._watch.followed
         notes = [
-            f'<span style="color:{run.color}">&#9632;</span> behind it: {escape(run.log.name)}'
+            f'<span style="color:{run.color}">&#9632;</span> behind it: {escape(run.text)}'
             for run in self._overlays
         ]
         if self._trigger.trigger is not None:

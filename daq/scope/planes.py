@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 from bokeh.layouts import gridplot
-from bokeh.models import ColumnDataSource
+from bokeh.models import ColumnDataSource, LogTicker
 from bokeh.models.widgets import Div
 from bokeh.plotting import figure
 
@@ -168,6 +168,7 @@ def _spectrum_figure(runs: Sequence[PlaneSources], name: str) -> figure:
     label = quantity_of(name).replace("_", " ")
     plot.yaxis.axis_label = label + (f"\n[{unit}]" if unit else "")
     plot.yaxis.axis_label_text_font_style = "normal"
+    plot.yaxis.ticker = LogTicker(desired_num_ticks=3)
     plot.min_border_left = 95
     for run in runs:
         plot.line("f", name, source=run.spectra, line_color=run.color, line_width=1.0)

@@ -21,7 +21,8 @@ _STATES = {
 VALUE_FIELDS = ("row", "color", "channel", "value", "unit", "difference", "style")
 FAILED = "The page stopped by a mistake in this program; reload it, and report this:"
 HELP = (
-    "Drag: zoom in time. Wheel: zoom. Click: set a mark; double click: remove it. "
+    "Orange: asked for. Blue: what came of it. Dotted red: a limit of the rig, where it is near."
+    "<br>Drag: zoom in time. Wheel: zoom. Click: set a mark; double click: remove it. "
     "Live, or the toolbar's reset: follow again."
 )
 
@@ -36,7 +37,7 @@ body {{ font: 14px/1.5 system-ui, sans-serif; margin: 8px; }}
 </style>
 </head>
 <body>
-<div id="first">{head}</div>
+<div id="first">{head}<p>The figures are being made …</p></div>
 <script src="{address}/static/js/bokeh.min.js"></script>
 <script src="{address}/static/js/bokeh-widgets.min.js"></script>
 """

@@ -19,7 +19,8 @@ _MOST = 65_536  # rows that are searched at a time
 class Trigger:
     """A channel's level and direction, and when it was passed last [s].
 
-    at: None before the first time. A passage counts when all of its stretch has been recorded.
+    at: None before the first time. A passage counts when all of its stretch has been recorded; of
+    a run that has ended without one, the last.
     """
 
     channel: str
@@ -28,14 +29,25 @@ class Trigger:
     at: float | None = None
     _after: float = -math.inf  # no passage before this one counts
 
-    def look(self, history: History, columns: tuple[str, ...], width: float) -> bool:
+    def look(
+        self, history: History, columns: tuple[str, ...], width: float, ended: bool = False
+    ) -> bool:
         """Look for the newest passage around which ``width`` seconds are there; whether it is new.
 
         Those that the picture of the last one shows do not count: it would run instead of stand.
+        ended: no more samples come.
         """
         if self.channel not in columns or not history.n_rows:
             return False
-        place, ready = columns.index(self.channel), history.span[1] - (1.0 - BEFORE) * width
+        end = history.span[1]
+        if self._look_until(end - (1.0 - BEFORE) * width, history, columns, width):
+            return True
+        return ended and self.at is None and self._look_until(end, history, columns, width)
+
+    def _look_until(
+        self, ready: float, history: History, columns: tuple[str, ...], width: float
+    ) -> bool:
+        place = columns.index(self.channel)
         rows = history.rows(max(history.span[0], self._after - width), ready, _MOST)
         times, values = rows[:, columns.index("t")], rows[:, place]
         noise = _HYSTERESIS * float(history.spread[place])

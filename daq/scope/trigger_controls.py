@@ -24,7 +24,7 @@ class TriggerControls:
         self.trigger: Trigger | None = None
         self._middle, self._changed = middle, changed
         self._edge = RadioButtonGroup(labels=list(_EDGES), active=0, name="edge")
-        self._channel = Select(width=170, name="trigger channel", visible=False)
+        self._channel = Select(width=220, name="trigger channel", visible=False)
         self._level = NumericInput(mode="float", width=90, name="level", visible=False)
         self._once = Toggle(label="hold at the next", name="once", width=130, visible=False)
         self._edge.on_change("active", self._offer_level)

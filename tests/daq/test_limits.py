@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from daq.cli.terminal import report_event
 from daq.config.rig import RigConfig
@@ -17,6 +18,7 @@ from daq.limits.load import i2t_levels
 from daq.lookup.rigs import load_rig
 from daq.rig import Rig
 from sim_rig.backend import SimulatedDevice, Simulation
+from tests.daq.support import write_rig
 from tests.sim_rig.support import PLANTS
 from tests.soak import mostly_soak
 
@@ -414,6 +416,30 @@ def test_a_cables_limit_is_left_out_where_the_plant_has_no_cable(capsys):
     assert "limits.winding of 0.25 turns is left out" in capsys.readouterr().err
     config, _ = load_rig("simulated.yaml", watch=report_event)
     assert config.limits.winding == 0.25 and not capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"torque": 7.0, "speed": 190.0, "current": {"motor": 5.0}}, []),
+        ({"torque": 7.1}, ["limits.torque: 7.1 N*m is never measured", "is 7.06 N*m by"]),
+        ({"current": {"motor": 5.1}}, ["limits.current.motor: 5.1 A", "is 5 A by"]),
+        ({"speed": 191.0}, ["limits.speed: 191 rad/s is beyond 190 rad/s, twice amplifiers.speed"]),
+        ({"speed": 151.0, "encoder": {"fastest": 150.0}}, ["beyond 150 rad/s, limits.encoder."]),
+    ],
+)
+def test_a_limit_that_nothing_can_pass_is_told(tmp_path, capsys, limits, words):
+    amplifiers = {"motor": 0.5, "speed": 95.0}
+    path = write_rig(tmp_path / "rig.yaml", amplifiers=amplifiers, limits=limits)
+    load_rig(str(path), watch=report_event)
+    said = capsys.readouterr().err
+    assert all(word in said for word in words) and bool(said) == bool(words), said
+
+
+@pytest.mark.parametrize("limits", [{"speed": 1e7}, {"torque": 1e9}, {"travel": [-1.0, 1e7]}])
+def test_an_absurd_limit_is_refused(limits):
+    with pytest.raises(ValidationError, match="less than or equal"):
+        RigConfig(limits=limits)
 
 
 def test_a_limit_of_ones_own_that_cannot_be_made_is_told_before_the_run(tmp_path):

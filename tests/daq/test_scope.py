@@ -277,6 +277,10 @@ def test_a_trigger_stands_at_the_newest_passage_that_is_shown_whole():
                 found[name].append(trigger.at)
     assert np.allclose(found["rises"], np.arange(5) + 1.0 / 12.0, atol=0.02)
     assert np.allclose(found["falls"], np.arange(5) + 5.0 / 12.0, atol=0.02)
+    late = Trigger("torque", 0.5, rising=True)
+    assert not late.look(history, columns, 50.0)
+    assert late.look(history, columns, 50.0, ended=True)
+    assert late.at == pytest.approx(4.0 + 1.0 / 12.0, abs=0.02)
     lost = Trigger("speed", 0.5, rising=True)
     assert not lost.look(history, columns, 0.5) and lost.text().endswith("0.5: not yet")
 
@@ -490,6 +494,7 @@ def test_the_page_says_something_before_bokeh_is_loaded(tmp_path):
         answer.begin()
         first = answer.read1()
         assert b"No run under runs yet" in first and b"bokeh.min.js" in first
+        assert b"figures are being made" in first
         assert request(f"{address}static/js/bokeh.min.js")[0] == 200
         process.stdin.close()
         assert b"autoload.js" in answer.read()
