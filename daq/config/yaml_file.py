@@ -232,7 +232,8 @@ def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]
 def nearest_file(path: Path, shipped: Sequence[str] = ()) -> str:
     """The cure for a missing file: the nearest name beside it or among the shipped, if any."""
     try:
-        beside = {each.stem: each for each in path.parent.iterdir() if each.suffix == path.suffix}
+        files = sorted(path.parent.iterdir())
+        beside = {each.stem: each for each in files if each.suffix in (path.suffix, ".yaml")}
     except OSError:
         beside = {}
     candidates = {**{Path(name).stem: Path(name) for name in shipped}, **beside}
