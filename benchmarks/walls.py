@@ -39,9 +39,10 @@ from daq.hal import FloatArray
 from daq.lookup.controllers import TunedController, load_controller
 from haptics import trial
 from haptics.dynamics import ActuatorDynamics
-from haptics.evidence import HAND, HAND_RANGE, STIFFEST_HAND, Scene, run_trials
+from haptics.evidence import HAND_RANGE, STIFFEST_HAND, Scene, run_trials
 from haptics.linear_loop import LinearLaw, loop_margins
 from haptics.passivity import Hands, Passivity, Tracker, UnknownPassivityError
+from haptics.program import HAND
 from protocols.control.loop import tracker_gains
 
 MODEL = "actuator:parameters=rig"

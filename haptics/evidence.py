@@ -21,13 +21,12 @@ from haptics import trial
 from haptics.dynamics import SHAFT, ActuatorDynamics
 from haptics.linear_loop import LinearLaw, LoopMargins, loop_margins
 from haptics.operating_points import Branch
-from haptics.program import trial_kernels
+from haptics.program import HAND, trial_kernels
 from sysid.engine.scheme import LANES, work_area
 from sysid.threads import one_thread
 
 BoolArray = NDArray[np.bool_]
 
-HAND = (0.16, 0.0179)  # N*m/rad, N*m*s/rad, by (A.2)
 HAND_RANGE = 4.0  # factor either way
 STIFFEST_HAND = 40.0  # N*m/rad, of those that walls are promised for: 250 times (A.2)'s
 NOISE = (5e-3, 5e-3, 7e-3)  # A, A, N*m: rms of the sensors

@@ -21,9 +21,10 @@ from sysid.engine.compiler import SampleLanes, compiled_text, sample_lanes
 from sysid.engine.scalar_text import ScalarEquations
 
 LONGEST_STEP = 4e-4  # s, of the model
-HAND = (
-    Parameter("hand_stiffness", "N*m/rad", 0.16, 0.0, 100.0),
-    Parameter("hand_damping", "N*m*s/rad", 0.0179, 0.0, 10.0),
+HAND = (0.16, 0.0179)  # N*m/rad, N*m*s/rad, by (A.2)
+_HAND = (
+    Parameter("hand_stiffness", "N*m/rad", HAND[0], 0.0, 100.0),
+    Parameter("hand_damping", "N*m*s/rad", HAND[1], 0.0, 10.0),
 )
 _LIMITED = "limits=true"
 LAWS = ("static", "feedforward", "lqg")
@@ -123,7 +124,7 @@ def held(model: ProcessModel) -> ProcessModel:
         model.states,
         (*held_inputs, Input("hand_theta", "rad", "foh"), Input("hand_omega", "rad/s")),
         (Output("theta", "rad"),),
-        (*model.parameters, *HAND),
+        (*model.parameters, *_HAND),
         in_hand,
     )
 

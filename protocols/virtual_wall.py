@@ -9,8 +9,9 @@ from daq.experiment import Controller, Evidence, Plan, TripLimits
 from daq.findings import Chart, Findings, Number, Series
 from daq.hal import FloatArray, Samples
 from daq.progress import Watch, ignore
-from haptics.evidence import HAND, HAND_RANGE, STIFFEST_HAND, Scene
+from haptics.evidence import HAND_RANGE, STIFFEST_HAND, Scene
 from haptics.passivity import Hands, Passivity, Tracker, UnknownPassivityError
+from haptics.program import HAND
 from protocols.analysis.results import DAMPING, STIFFNESS
 from protocols.analysis.walls import WallFindings, WallTheory, visited
 from protocols.control.loop import command_bounds, tracker_gains

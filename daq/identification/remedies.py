@@ -37,12 +37,12 @@ def remedies(
 
     >>> from sysid.problem.faults import DataFault
     >>> late = DataFault("lag", "doubt", "training", ("log",), "y", "", "", "", 1.0,
-    ...     setting="delay.y=0.004")
+    ...     settings=("delay.y=0.004",))
     >>> remedies(IdentificationConfig(), faults=[late])
     ('delay.y=0.004',)
     """
     doubts = [fault for fault in faults if fault.severity == "doubt"]
-    of_faults = [setting for fault in doubts for setting in fault.setting.splitlines()]
+    of_faults = [setting for fault in doubts for setting in fault.settings]
     changes: dict[str, str] = dict(setting.split("=", 1) for setting in of_faults)
     lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
     units = channels or {}

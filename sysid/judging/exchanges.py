@@ -19,7 +19,7 @@ from scipy.special import chdtrc
 from sysid.arrays import FloatArray
 from sysid.judging.evidence import independent_samples
 from sysid.judging.residual_tests import residual_test
-from sysid.judging.score_tests import Finding, Move
+from sysid.judging.score_tests import Finding, moves_of
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent
 from sysid.problem.model import Input, ModelError, Output
@@ -99,14 +99,9 @@ def _tested(
     p_value = float(chdtrc(1, max(-samples * len(before) * np.log(share), 0.0)))
     if share > _LESS or p_value > _SURE:
         return None
-    moves = [
-        Move(e, change := e.at(fitted.parameters_) - e.value, change / e.deviation)
-        for e in uncertainty.determined()
-        if e.deviation
-    ]
-    moves.sort(key=lambda move: -abs(move.deviations))
-    name = " and ".join(names)
-    return Finding("exchange", name, "", 1.0, p_value, 1.0 - share, tuple(moves))
+    determined = uncertainty.determined()
+    moves = moves_of(determined, [e.at(fitted.parameters_) - e.value for e in determined])
+    return Finding("exchange", " and ".join(names), "", 1.0, p_value, 1.0 - share, moves)
 
 
 def _signals(estimator: GASSI, side: Side) -> Sequence[Input | Output]:

@@ -141,7 +141,7 @@ def _faults(
             "needs one in its inputs",
             share=1.0,
             moves_parameters=part == "training",
-            setting=f"delay.{channel}={count * records[0].dt:.3g}",
+            settings=(f"delay.{channel}={count * records[0].dt:.3g}",),
         )
 
 

@@ -124,8 +124,8 @@ def start_faults(
     >>> model = lag()
     >>> model = replace(model, states=(replace(model.states[0], initial_range=(5.0, 6.0)),))
     >>> fault, = start_faults(model, [lag_record()])
-    >>> fault.kind, fault.channel, fault.setting
-    ('start', 'y', 'initial.y=[-0.497, 6]')
+    >>> fault.kind, fault.channel, fault.settings
+    ('start', 'y', ('initial.y=[-0.497, 6]',))
     """
     return tuple(
         fault
@@ -167,7 +167,7 @@ def _start_fault(
         1.0,
         part == "training",
         part == "validation",
-        f"initial.{state.name}={wider}",
+        (f"initial.{state.name}={wider}",),
     )
 
 

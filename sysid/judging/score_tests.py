@@ -85,6 +85,14 @@ class Move:
     deviations: float
 
 
+def moves_of(estimates: Iterable[Estimate], changes: Iterable[float]) -> tuple[Move, ...]:
+    """Moves of the estimates that have a deviation, the farthest first."""
+    moves = [
+        Move(e, c, c / e.deviation) for e, c in zip(estimates, changes, strict=True) if e.deviation
+    ]
+    return tuple(sorted(moves, key=lambda move: -abs(move.deviations)))
+
+
 @dataclass(frozen=True)
 class Finding:
     """Something that the model lacks: what it is, how sure, and what it would move.
@@ -381,12 +389,6 @@ class _Tests:
         self, suspect: Suspect, result: "_Result", log_p: float, term: AddedTerm | None
     ) -> Finding:
         moved = self._gradients @ result.move[: self._gradients.shape[1]]
-        moves = [
-            Move(e, float(change), float(change) / e.deviation)
-            for e, change in zip(self._estimates, moved, strict=True)
-            if e.deviation
-        ]
-        moves.sort(key=lambda move: -abs(move.deviations))
         several, amplitudes = suspect.kind in _SEVERAL, result.amplitudes
         return Finding(
             suspect.kind,
@@ -395,7 +397,7 @@ class _Tests:
             None if several else float(amplitudes[0]),
             float(np.exp(min(log_p, 0.0))),
             result.share,
-            tuple(moves),
+            moves_of(self._estimates, moved.tolist()),
             term,
             suspect.of_input,
         )

@@ -48,8 +48,8 @@ class DataFault:
     is said of them; cure: how to mend it. severity: ``doubt`` where a result may be wrong by it,
     ``note`` where the user has to judge. share: of the samples of the worst record, the first of
     ``records``. moves_parameters: whether it biases parameters beyond what their intervals know.
-    voids_validation: whether it makes the errors in validation no evidence. setting: ``KEY=VALUE``,
-    one a line, of an identification's configuration that take it out; empty for none.
+    voids_validation: whether it makes the errors in validation no evidence. settings: ``KEY=VALUE``
+    of an identification's configuration that take it out.
 
     >>> fault = DataFault("still", "doubt", "validation", ("rest",), "", "it does not move",
     ...     "a validation that does not move is none", "validate with another log", 1.0,
@@ -69,7 +69,7 @@ class DataFault:
     share: float
     moves_parameters: bool = False
     voids_validation: bool = False
-    setting: str = ""
+    settings: tuple[str, ...] = ()
 
     @property
     def sentence(self) -> str:
@@ -155,8 +155,8 @@ def _merged(faults: Sequence[DataFault]) -> list[DataFault]:
     for group in alike.values():
         ordered = sorted(group, key=lambda fault: (fault.part == "validation", -fault.share))
         records = dict.fromkeys(name for fault in ordered for name in fault.records)
-        settings = "\n".join(dict.fromkeys(fault.setting for fault in ordered if fault.setting))
-        merged.append(replace(ordered[0], records=tuple(records), setting=settings))
+        settings = dict.fromkeys(setting for fault in ordered for setting in fault.settings)
+        merged.append(replace(ordered[0], records=tuple(records), settings=tuple(settings)))
     return merged
 
 
@@ -294,9 +294,9 @@ class _Channel:
     ) -> DataFault:
         where = self.part, (self.record.name,), self.name
         moves = severity == "doubt" and self.part == "training"
-        setting = "robust=true" if "'robust: true'" in cure else ""
+        settings = ("robust=true",) if "'robust: true'" in cure else ()
         return DataFault(
-            kind, severity, *where, statement, effect, cure, share, moves, setting=setting
+            kind, severity, *where, statement, effect, cure, share, moves, settings=settings
         )
 
 
@@ -323,13 +323,13 @@ def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:
     else:
         cure = f"fit the part without gaps ('use: {part_without}'), or record anew"
     named = re.fullmatch(r"[\w-]+", record.name) is not None  # as a key can be
-    setting = f"use.{record.name}={part_without}" if part_without and named else ""
+    settings = (f"use.{record.name}={part_without}",) if part_without and named else ()
     yield DataFault(
         "gap", "doubt" if many else "note", part, (record.name,), "",
         f"{int(lost.sum())} samples ({_percent(share)}) are missing in {int(gaps.sum())} "
         f"gap{'s' * (int(gaps.sum()) != 1)}, the longest of {longest * usual * record.dt:.3g} s",
         "what its inputs did meanwhile is not known, and counts as if they had gone on",
-        cure, share, moves_parameters=many and part == "training", setting=setting,
+        cure, share, moves_parameters=many and part == "training", settings=settings,
     )  # fmt: skip
 
 

@@ -205,8 +205,8 @@ def test_a_gap_is_cut_out_by_the_setting_that_is_named_for_it(folder):
         return data_faults(asked.model, [loaded.dataset])
 
     (gap,) = faults()
-    assert (gap.kind, gap.setting) == ("gap", "use.gap=100.9 s .. 102.999 s")
-    assert faults(gap.setting) == ()
+    assert (gap.kind, gap.settings) == ("gap", ("use.gap=100.9 s .. 102.999 s",))
+    assert faults(*gap.settings) == ()
 
 
 def test_a_replay_reads_a_log_as_the_identification_did(folder):

@@ -34,8 +34,8 @@ def found(kind, name, amplitude, share=0.5):
     return Finding(kind, name, "s", amplitude, 1e-12, share, ())
 
 
-def fault(kind, severity="doubt", setting=""):
-    return DataFault(kind, severity, "training", ("log",), "y", "", "", "", 0.1, setting=setting)
+def fault(kind, severity="doubt", settings=()):
+    return DataFault(kind, severity, "training", ("log",), "y", "", "", "", 0.1, settings=settings)
 
 
 def mended(findings=(), faults=(), pushed=None, **content):
@@ -80,8 +80,8 @@ def test_what_counts_little_or_is_of_a_single_log_is_left_alone():
 
 
 def test_faults_of_samples_come_first_and_a_lag_is_taken_out_once():
-    late = fault("lag", setting="delay.y=0.004")
-    jolts = fault("outliers", setting="robust=true")
+    late = fault("lag", settings=["delay.y=0.004"])
+    jolts = fault("outliers", settings=["robust=true"])
     assert mended([found("delay", "u", 0.001)], [jolts, late]) == (
         "robust=true",
         "delay.y=0.004",
@@ -108,14 +108,14 @@ def test_gains_offsets_and_drifts_become_parameters():
         "channels.y.drift=[-0.05, 0.05]",
     )
     assert settings(**{"channels": {"u": {"offset": [-0.2, 0.2]}}}).channels["u"].gain is None
-    assert mended(wrong, [fault("gap", setting="use.log=0 s .. 1 s")]) == ("use.log=0 s .. 1 s",)
+    assert mended(wrong, [fault("gap", settings=["use.log=0 s .. 1 s"])]) == ("use.log=0 s .. 1 s",)
 
 
 @pytest.mark.parametrize(("value", "ends"), [(1e-5, "[1e-6, 0.001]"), (1e-3, "[1e-5, 0.01]")])
 def test_a_range_whose_end_decides_is_widened_there_once_the_data_are_right(value, ends):
     pushed = {"J": (value, 1e-5, 1e-3)}
     assert mended(pushed=pushed) == (f"ranges.J={ends}",)
-    jolts = fault("outliers", setting="robust=true")
+    jolts = fault("outliers", settings=["robust=true"])
     assert mended(faults=[jolts], pushed=pushed) == ("robust=true",)
 
 

@@ -10,11 +10,12 @@ from daq.experiment import Sample
 from daq.lookup.controllers import load_controller
 from haptics import laws
 from haptics.dynamics import ActuatorDynamics
-from haptics.evidence import HAND, HAND_RANGE
+from haptics.evidence import HAND_RANGE
 from haptics.feedforward import Feedforward
 from haptics.linear_loop import LinearLaw, loop_margins, sampled_actuator
 from haptics.operating_points import operating_point
 from haptics.passivity import Hands, Passivity, Port, Tracker, UnknownPassivityError, discs
+from haptics.program import HAND
 from protocols.control.loop import tracker_gains
 from tests.haptics.test_torque_tracking import controller
 

@@ -5,9 +5,8 @@ import pytest
 
 from daq.experiment import Sample
 from haptics import laws
-from haptics.evidence import HAND
 from haptics.lqg import Lqg
-from haptics.program import ProgramLaw
+from haptics.program import HAND, ProgramLaw
 from sim_rig.actuator import actuator
 from sim_rig.plant import Plant, state_sizes
 from sysid import Stepper
