@@ -41,6 +41,11 @@ class SettingsRequest:
         config = None if self.config is None else _absolute([self.config])[0]
         return SettingsRequest(config, options, list(self.settings))
 
+    @property
+    def config_words(self) -> list[str]:
+        """Words that name its file again; none without one."""
+        return [] if self.config is None else ["--config", _from_here(self.config)]
+
     def words(self, settings: Sequence[str] = (), **options: Any) -> list[str]:
         """Words of ``rig identify`` behind its logs that ask for the same, but for what is given.
 
@@ -48,7 +53,7 @@ class SettingsRequest:
         >>> " ".join(asked.words(["delay.omega=4 ms"], model="lag"))
         '--config drive.yaml --model lag --seed 1 --guess --set robust=true --set delay.omega=4 ms'
         """
-        words = [] if self.config is None else ["--config", _from_here(self.config)]
+        words = self.config_words
         whole = {**self.options, **options}
         for name, value in sorted(whole.items(), key=lambda option: option[0] != "model"):
             for each in value if isinstance(value, list | tuple) else [value]:

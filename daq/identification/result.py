@@ -242,7 +242,7 @@ class Identification(Shown):
         if not wide or self.folder is None or typed & _NOT_OF_DESIGNS:
             return None
         request, model = self.problem.request, self.problem.model_name
-        more = [] if request.config is None else ["--config", request.config]
+        more = request.config_words
         more += ["--model", model] if self.trust_option else []  # named, it needs no trust
         logs = [fitted.log.path for fitted in self.training]
         command = design_command(self.folder, logs, more)
