@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -44,9 +45,11 @@ def next_commands(folder: Path) -> list[str]:
 
     results = folder / RESULTS
     if not results.exists():
-        return [f"rig identify {folder}"]
+        return [f"rig identify {shlex.quote(str(folder))}"]
     ranges = results / "ranges.yaml"
-    return [f"rig run prbs.yaml --identify --config {ranges}"] if ranges.exists() else []
+    if not ranges.exists():
+        return []
+    return [f"rig run prbs.yaml --identify --config {shlex.quote(str(ranges))}"]
 
 
 def show_findings(findings: Findings, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -92,7 +93,9 @@ def _show(result: CampaignResult) -> None:
         print(f"Best of {shown.get(model, model)} on {data}: {path}")
     print(f"All runs with their parameters: {result.table}")
     for (model, _), path in list(result.files.items())[:1]:
-        terminal.print_next(f"rig replay LOG --parameters {path}{trust_option(model)}")
+        terminal.print_next(
+            f"rig replay LOG --parameters {shlex.quote(str(path))}{trust_option(model)}"
+        )
 
 
 def _spread_row(spread: Spread, result: CampaignResult, outputs: Sequence[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,12 +56,12 @@ def check(
     _show(checked)
     if plot is not None:
         print(f"Figure: {plot}")
-    on = f" --rig {rig}" if rig is not None else ""
+    on = f" --rig {shlex.quote(rig)}" if rig is not None else ""
     if lacks_port(checked.session.rig):
         port = "PORT"  # to be filled in, as rig ports has it
     on += f" --port {port}" if port is not None else ""
     identify = " --identify" if checked.session.validation and not checked.concludes else ""
-    terminal.print_next(f"rig run {experiment}{on}{identify}")
+    terminal.print_next(f"rig run {shlex.quote(experiment)}{on}{identify}")
 
 
 def _show(checked: Preview) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -103,10 +104,10 @@ def _show_next(result: Identification) -> None:
 
     step = result.next_step
     mapping = result.problem.mapping
-    columns = f" --config {mapping.file.path}" if mapping is not None else ""
-    columns += set_options(result.problem.reading)
     log = (*result.validation, *result.training)[0].log.path
-    replay = f"rig replay {log} --parameters {result.parameters_file}{columns}{result.trust_option}"
+    words = ["rig", "replay", str(log), "--parameters", str(result.parameters_file)]
+    words += ["--config", str(mapping.file.path)] if mapping is not None else []
+    replay = f"{shlex.join(words)}{set_options(result.problem.reading)}{result.trust_option}"
     if step is None:
         terminal.print_next(replay)
     else:
@@ -337,7 +338,8 @@ def show_comparison(
             print(f"Page: {files['page']}")
     name = result.comparison.preferred
     if not json and name in result.files:
-        terminal.print_next(f"rig replay LOG --parameters {result.files[name]}{trust_option(name)}")
+        parameters = shlex.quote(str(result.files[name]))
+        terminal.print_next(f"rig replay LOG --parameters {parameters}{trust_option(name)}")
     return {**result.document, "files": files}
 
 

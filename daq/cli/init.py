@@ -1,5 +1,6 @@
 """``rig init``: a folder with an experiment, a rig and settings of an identification to change."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -50,7 +51,7 @@ def init(
     print(f"Written: {schema_folder}, by which editors check these files")
     for path in starter.kept:
         print(f"Kept as it was: {path}")
-    there = [] if folder.resolve() == Path.cwd() else [f"cd {folder}"]
+    there = [] if folder.resolve() == Path.cwd() else [f"cd {shlex.quote(str(folder))}"]
     experiment = f"{protocol or DEFAULT_PROTOCOL}.yaml"
     if starter.hardware:
         terminal.print_next(*there)

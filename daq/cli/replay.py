@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -71,11 +72,12 @@ def replay(
         if drawn is not None:
             print(f"Figure: {drawn}")
         if all(document["passed"] for document in documents):
-            columns = f" --config {config}" if config is not None else ""
+            columns = f" --config {shlex.quote(str(config))}" if config is not None else ""
             columns += set_options(settings or [])
             trusted = " --trust" if trust else ""
-            again = f"rig replay ANOTHER_LOG --parameters {parameters}{columns}{trusted}"
-            terminal.print_next(again if parameters else f"rig identify {log}")
+            result = shlex.quote(str(parameters))
+            again = f"rig replay ANOTHER_LOG --parameters {result}{columns}{trusted}"
+            terminal.print_next(again if parameters else f"rig identify {shlex.quote(str(log))}")
     shortfalls = [
         f"fit of {name} is {result.fit[name]:.1f} %, below {least:g} %"
         + (f" ({result.source})" if len(results) > 1 else "")

@@ -1,6 +1,7 @@
 """What a protocol concludes from its run, in numbers, tables and figures."""
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,7 @@ def analyse(folder: str | Path, *, trust: bool = False, watch: Watch = ignore) -
         raise ConfigError(
             f"the protocol {nearby(experiment.protocol)!r} only excites, and concludes nothing by "
             "itself",
-            cure=f"rig identify {folder} finds parameters",
+            cure=f"rig identify {shlex.quote(str(folder))} finds parameters",
             file=folder,
         )
     return Analysis(folder, findings)

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import shlex
 import subprocess
 
 import numpy as np
@@ -87,6 +88,13 @@ def test_a_multisine_is_stated_without_its_ramps(command, tmp_path):
     assert stated["resolution_hz"] == 0.5
     assert f"crest factor {motor['crest_factor']:.3f}" in stated["remarks"][1]
     assert motor["power_band_hz"][0] >= 1.0 and motor["power_band_hz"][1] <= 99.0
+
+
+def test_the_next_command_can_be_typed_as_it_stands(command, tmp_path):
+    write_experiment(tmp_path / "my first.yaml", validation={"motor": {"seed": 9}})
+    result = command(["check", "my first.yaml"], tmp_path)
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("Next: ")]
+    assert shlex.split(line)[1:] == ["rig", "run", "my first.yaml", "--identify"]
 
 
 @pytest.mark.parametrize("n", [400, 401])
