@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.errors import ConfigError
-from daq.files import write_whole
+from daq.files import make_folder, write_whole
 from daq.lookup.controllers import load_controller
 from daq.torque import LawProgram
 from sysid import ModelError
@@ -85,6 +85,7 @@ class DeviceCode:
     def save(self, folder: Path, name: str) -> tuple[Path, Path]:
         """Write ``NAME.h`` and ``NAME.c``. Raises ConfigError for a folder that takes none."""
         paths = folder / f"{name}.h", folder / f"{name}.c"
+        make_folder(folder)
         write_whole(paths[0], self.header)
         write_whole(paths[1], f'#include "{name}.h"\n{self.source}')
         return paths

@@ -1,5 +1,6 @@
 """Models of a user's own that do not end: which function, where, and within a bounded time."""
 
+import json
 import re
 import signal
 import subprocess
@@ -133,9 +134,10 @@ with heeded():
 @pytest.mark.soak
 def test_ctrl_c_ends_compiled_equations_without_end():
     done = subprocess.run(
-        [sys.executable, "-c", STUCK], env=environment(), capture_output=True, text=True,
+        [sys.executable, "-c", STUCK, "--json"], env=environment(), capture_output=True, text=True,
         timeout=120, check=False,
     )  # fmt: skip
     said = "rig: stopped by Ctrl-C, in compiled equations that have no end; give every loop in"
     assert done.returncode == 1
     assert done.stderr.startswith(said)
+    assert json.loads(done.stdout)["exit_status"] == 1
