@@ -333,9 +333,10 @@ def _logs(rounds: Sequence[Round]) -> list[Path]:
 def _identify(
     rounds: Sequence[Round], request: Request, watch: Watch, *, ends: bool = False
 ) -> None:
-    """Identify from all runs until now, and publish the result.
+    """Identify from all runs until now.
 
-    What the model may lack is tested where this is the end, from all that there is to judge by.
+    Where this is the end, from all that there is to judge by, what the model may lack is tested,
+    and the report is written.
     """
     folder = rounds[-1].identification
     problem = problem_of(SettingsRequest(request.config, {"model": request.model}), watch)
@@ -348,5 +349,6 @@ def _identify(
     identification = fit(problem, logs, [], folder, watch, resume=going_on, examine=is_last)
     if identification.interrupted:
         raise KeyboardInterrupt
-    make_folder(rounds[-1].root / "report")
-    publish(identification, rounds[-1].root / "report", watch)
+    if is_last(identification):
+        make_folder(rounds[-1].root / "report")
+        publish(identification, rounds[-1].root / "report", watch)

@@ -38,6 +38,7 @@ _OPTIONS: dict[str, Any] = {
     # assume away the NaN and infinity by which a failed simulation is recognised.
     "error_model": "numpy",
     "fastmath": {"contract", "arcp", "nsz"},
+    "no_cfunc_wrapper": True,  # for calls from C, of which there are none
 }
 
 
@@ -177,7 +178,7 @@ def _compiled(
     path = _define(f"{name}_{_key(text, called)}.py", text, scope)
     for name in ("constants", "remainder", "observe", "margins", "gains"):
         if name in scope:
-            scope[name] = _njit(scope[name])
+            scope[name] = _njit(scope[name], no_cpython_wrapper=True)
     return [_njit(scope[name], nogil=True, cache=path is not None) for name in functions]
 
 
@@ -212,7 +213,7 @@ def compiled_text(
     path = _define(f"{name}_{_key(text, {})}.py", text, scope)
     for key, item in scope.items():
         if isinstance(item, types.FunctionType) and key not in functions:
-            scope[key] = _njit(item)
+            scope[key] = _njit(item, no_cpython_wrapper=True)
     scope |= called or {}
     return [_njit(scope[key], nogil=True, cache=path is not None) for key in functions]
 
@@ -296,10 +297,10 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
     return key.hexdigest()[:24]
 
 
-def _njit(function: Any, *, nogil: bool = False, cache: bool = False) -> Any:
+def _njit(function: Any, *, cache: bool = False, **options: bool) -> Any:
     import numba
 
-    dispatcher = numba.njit(nogil=nogil, **_OPTIONS)(function)
+    dispatcher = numba.njit(**_OPTIONS, **options)(function)
     if cache:
         # RuntimeError: neither beside the text nor elsewhere can the compiler write.
         with contextlib.suppress(RuntimeError):

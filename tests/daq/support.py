@@ -153,7 +153,8 @@ import gc, importlib.metadata, json, os, signal, sys, traceback
 import daq.cli, daq.cli.app, daq.figures.findings, daq.identification.comparison
 import daq.identification.fit, daq.identification.replay, daq.recording.preview, daq.serial.backend
 import matplotlib.figure, numba, pandas, pint, pydantic.type_adapter, rich.progress, rich.table
-import sim_rig.actuator, sim_rig.backend, sysid.engine.intrinsics, sysid.engine.phi
+import scipy.interpolate, sim_rig.actuator, sim_rig.backend, sysid.engine.rate
+import sysid.engine.phi, sysid.gassi, sysid.judging.alternatives
 for protocol in importlib.metadata.entry_points(group="rig.protocols"):
     protocol.load()
 daq.config.units.factor("rpm", "rad/s")
