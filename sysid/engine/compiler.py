@@ -297,7 +297,7 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
     return key.hexdigest()[:24]
 
 
-def _njit(function: Any, *, cache: bool = False, **options: bool) -> Any:
+def _njit(function: Any, *, cache: bool = False, **options: Any) -> Any:
     import numba
 
     dispatcher = numba.njit(**_OPTIONS, **options)(function)
