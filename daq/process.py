@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
 import sys
@@ -82,6 +83,14 @@ class RunProcess:
         finally:
             os.close(handle)
         return True
+
+
+def signal_main_thread(number: signal.Signals) -> None:
+    """From another thread: have the main one hear a signal, out of the call it waits in."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:  # Windows: heard once the call is back in Python
+        _thread.interrupt_main(number)
 
 
 def _identity(pid: int) -> tuple[int, str] | None:

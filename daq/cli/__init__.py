@@ -1,5 +1,7 @@
 """The ``rig`` command."""
 
+from __future__ import annotations
+
 import contextlib
 import gc
 import os
@@ -10,18 +12,21 @@ from collections.abc import Sequence
 from types import FrameType
 
 from daq.errors import Mistake, RigError, Terminated
+from daq.process import signal_main_thread
 
 _INTERRUPTED = 130  # what Typer makes of Ctrl-C
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # where there is such a signal
 # New objects between two searches for what only refers to itself. By Python's 700 there are
 # hundreds of searches while modules are loaded and figures drawn, in vain.
 _BETWEEN_COLLECTIONS = 50_000
+_LATER = 0.02  # s until a signal whose error Python swallowed is sent once more
 
 
 def main() -> None:
     """Run the command line; expected errors end it with their message and exit status."""
     ended: list[bool] = []
-    heard = _hear_signals(ended)
+    swallowed: list[BaseException] = []
+    heard = _hear_signals(ended, swallowed)
     end: BaseException | None = None
     try:
         gc.set_threshold(_BETWEEN_COLLECTIONS)
@@ -37,6 +42,9 @@ def main() -> None:
     ended.append(True)
     for number in heard:
         signal.signal(number, signal.SIG_IGN)
+    # What a compiler says that was interrupted in a callback is no news.
+    if swallowed and isinstance(end, Exception):
+        end = swallowed[0]
     status = _status(end)
     if _is_stopped(end):
         # The interpreter would wait for threads and, while it winds up, die of the next signal.
@@ -48,10 +56,11 @@ def main() -> None:
     sys.exit(status)
 
 
-def _hear_signals(ended: Sequence[bool]) -> list[int]:
+def _hear_signals(ended: Sequence[bool], swallowed: list[BaseException]) -> list[int]:
     """Have signals that end a program raise, but those ignored from its start; which they are.
 
-    ended: not empty once there is nothing left to end.
+    ended: not empty once there is nothing left to end. swallowed: what was raised where Python
+    cannot raise, as in a callback of compiled code, until the signal is sent once more.
     """
     if threading.current_thread() is not threading.main_thread():
         return []
@@ -59,13 +68,32 @@ def _hear_signals(ended: Sequence[bool]) -> list[int]:
     defaults = (signal.default_int_handler, signal.SIG_DFL)
     heard = [number for number in numbers if signal.getsignal(number) in defaults]
 
+    raised: dict[int, BaseException] = {}
+    hook = sys.unraisablehook
+
     def interrupt(number: int, frame: FrameType | None) -> None:
         if ended or (frame is not None and frame.f_code is main.__code__):
             return  # the command has ended, and nothing would catch what is raised here
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        raise Terminated(signal.Signals(number).name)
+        swallowed.clear()
+        name = signal.Signals(number).name
+        raised[number] = KeyboardInterrupt() if number == signal.SIGINT else Terminated(name)
+        raise raised[number]
 
+    def again(number: int) -> None:
+        if not ended:
+            signal_main_thread(signal.Signals(number))
+
+    def swallow(unraisable: sys.UnraisableHookArgs) -> None:
+        for number, error in raised.items():
+            if unraisable.exc_value is error:
+                swallowed.append(error)
+                timer = threading.Timer(_LATER, again, [number])
+                timer.daemon = True
+                timer.start()
+                return
+        hook(unraisable)
+
+    sys.unraisablehook = swallow
     for number in heard:
         signal.signal(number, interrupt)
     return heard

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import os
 import signal
@@ -14,6 +13,7 @@ from types import CodeType, FrameType
 from typing import Any, NoReturn
 
 from daq.errors import Terminated
+from daq.process import signal_main_thread
 
 # Ctrl-C; a polite kill; a closed terminal; Ctrl-Break on Windows; Ctrl-\ and Ctrl-Z on a terminal:
 # a program that is suspended watches no limits. Where there is such a signal.
@@ -90,10 +90,7 @@ class SignalHandling:
                 return  # over, not in the main thread, or all are ignored: it would end all
             number = signal.Signals(self._before[0][0])
             self._interruption = error
-            if hasattr(signal, "pthread_kill"):
-                signal.pthread_kill(threading.main_thread().ident or 0, number)
-            else:  # Windows: heard once the call is back in Python
-                _thread.interrupt_main(number)
+            signal_main_thread(number)
 
     def _swallowed(self, unraisable: sys.UnraisableHookArgs) -> None:
         """Python's hook for errors that it cannot raise: ours are raised later."""

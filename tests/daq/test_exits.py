@@ -395,6 +395,23 @@ def test_ctrl_c_while_the_program_is_still_being_imported_is_no_traceback():
     assert result.stderr.strip() == "rig: stopped by Ctrl-C"
 
 
+@pytest.mark.parametrize("then", ["raise RuntimeError('no object')", "threading.Event().wait(60)"])
+def test_ctrl_c_in_a_callback_of_a_compilers_is_not_lost(then):
+    code = (
+        "import ctypes, signal, threading\n"
+        "import daq.cli.app\n"
+        "def compiling():\n"
+        "    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()\n"
+        f"    {then}\n"
+        "daq.cli.app.app = compiling\n"
+        "daq.cli.main()\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (result.returncode, result.stderr) == (1, "rig: stopped by Ctrl-C\n")
+
+
 def test_with_json_a_failure_is_a_document_too(tmp_path):
     write_experiment(tmp_path / "bad.yaml", motor={"amplitude": "much"}, sample_rate=-1)
     result = rig("check", "bad.yaml", "--json", cwd=tmp_path)
