@@ -115,6 +115,13 @@ class BatchSimulator:
         most = max(self.max_steps, _MOST_STEPS)
         return BatchSimulator(self.model, accuracy=accuracy, threads=self.threads, max_steps=most)
 
+    def within(self, max_steps: int) -> BatchSimulator:
+        """The same simulations, with no more steps per sample than that, nor than before."""
+        most = min(self.max_steps, max_steps)
+        return BatchSimulator(
+            self.model, accuracy=self.accuracy, threads=self.threads, max_steps=most
+        )
+
     def errors(
         self,
         parameters: FloatArray,

@@ -28,6 +28,9 @@ from sysid.problem.space import SearchSpace
 # Whether records count by their samples or each alike.
 Balance = Literal["samples", "logs"]
 
+# Integration steps per sample that are never too many, and how many times those of most are.
+_FEW_STEPS, _FAR_MORE = 64, 8
+
 
 @dataclass(frozen=True)
 class Responses:
@@ -119,6 +122,16 @@ class Objective:
     def free_run(self) -> Objective:
         """The objective of the free run's errors: this one."""
         return self
+
+    def sparing(self) -> Objective:
+        """The same objective, in which chromosomes fail that are far slower to simulate than most.
+
+        A few that are stiff would take most of a search's time. Most are taken to need the steps
+        of the middle of the ranges.
+        """
+        middle = self.space.full(self.space.decode(np.mean(self.space.coded_bounds, axis=0)[None]))
+        steps = [int(self.simulator.steps_of_each(middle, record)[0]) for record in self.records]
+        return self._with(simulator=self.simulator.within(max(_FEW_STEPS, _FAR_MORE * max(steps))))
 
     def finer(self, accuracy: float) -> Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""

@@ -62,6 +62,7 @@ class LocalSearch:
 
     def __post_init__(self, starts: FloatArray) -> None:
         self.n_varied = len(self.objective.space.index)
+        self.sparing = self.objective.sparing()
         self.points = int(np.clip(self.points // self.n_varied, _FEWEST_POINTS, _MOST_POINTS))
         self.iteration_cost = refinement.simulations_per_iteration(self.objective)
         affordable = max(1, self.left // (_ITERATIONS_EACH * self.iteration_cost))
@@ -237,10 +238,10 @@ class LocalSearch:
         return [Point(row, float(error)) for row, error in zip(rows, errors, strict=True)]
 
     def _errors(self, rows: FloatArray) -> FloatArray:
-        """Error at each row of coordinates, infinite where it is infeasible."""
+        """Error at each row of coordinates, infinite where it is infeasible or slow to simulate."""
         space = self.objective.space
         chromosomes = space.decode(rows)
-        errors, _ = self.objective.evaluate(chromosomes)
+        errors, _ = self.sparing.evaluate(chromosomes)
         return np.where(np.any(space.violations(chromosomes) > 0.0, axis=1), np.inf, errors)
 
 

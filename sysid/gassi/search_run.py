@@ -46,6 +46,10 @@ class SearchRun:
     history: list[float] = field(default_factory=list)
     flagged: dict[str, int] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        refines = self.search.preset.refine
+        self._bred = self.objective.sparing() if refines else self.objective
+
     @property
     def done(self) -> bool:
         """Whether there is nothing left to do."""
@@ -112,7 +116,7 @@ class SearchRun:
         self.history, self.flagged = state["history"], state["flagged"]
 
     def _breed(self) -> None:
-        errors, result = self.objective.evaluate(self.search.ask())
+        errors, result = self._bred.evaluate(self.search.ask())
         for status in (Status.UNBOUNDED, Status.OVER_BUDGET):
             count = int(np.sum(result.status == status))
             if count:

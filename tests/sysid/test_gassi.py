@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from sklearn.base import clone
@@ -15,6 +17,7 @@ from sysid import (
     ProcessModel,
     State,
 )
+from sysid.engine.simulation import BatchSimulator
 from tests.soak import mostly_soak
 from tests.sysid.support import INFEASIBLE, MOTOR, lag, motor, motor_record
 
@@ -175,6 +178,24 @@ def test_failures_are_counted():
     found = GASSI(model, population=200, generations=2, preset="thesis").fit(record)
     assert sum(found.flagged_.values()) > 0
     assert set(found.flagged_) <= {"unbounded", "over_budget"}
+
+
+def test_what_is_far_stiffer_than_most_is_found_though_the_search_passes_over_it():
+    """It takes 362 steps a sample, the middle of the ranges 4: beyond 64 none is simulated."""
+    model = lag(
+        parameters=(Parameter("dry", "1", 2.0, 0.02, 200.0, "log"),),
+        derivative=lambda x, u, p: (u[0] - p[0] * math.tanh(1e3 * x[0]) - 5.0 * x[0],),
+    )
+    rng, truth = np.random.default_rng(0), np.array([[110.0]])
+    inputs = np.repeat(rng.uniform(-150.0, 150.0, 20), 10)
+    blank = Dataset(inputs, np.zeros(200), 0.01)
+    exact = BatchSimulator(model, accuracy=1e-6, max_steps=8192).trajectories(truth, blank)[0]
+    noisy = exact + 0.01 * np.abs(exact).max() * rng.standard_normal(exact.shape)
+    record = Dataset(inputs, noisy, 0.01)
+    assert BatchSimulator(model).steps_of_each(truth, record) > 300
+    found = GASSI(model, population=60, generations=12).fit(record)
+    assert found.flagged_["over_budget"] > 0
+    assert found.parameters_["dry"] == pytest.approx(110.0, rel=0.01)
 
 
 def test_infeasible_answers_are_said_to_be():
