@@ -24,10 +24,10 @@ A number with a unit may be written with one: `0.005`, `5 ms` and `0.005 s` are 
 are not in the table are mistakes.
 """
 _STATUS = (
-    "`rig COMMAND --help` says the same. Exit status: 0 done, 1 the run failed, an interlock tripped "
-    "or it was stopped, 2 wrong usage or configuration. With `--json` a command that fails or is "
-    "stopped prints a document as well: `exit_status`; `errors`, each with `error`, `file`, `line`, "
-    "`column`, `key`, `cure`; and `notes`, such as where the log of an interrupted run is."
+    "`rig COMMAND --help` says the same. Exit status: 0 done, 1 the run failed, an interlock "
+    "tripped or it was stopped, 2 wrong usage or configuration. With `--json` a command that fails "
+    "or is stopped prints a document as well: `exit_status`; `errors`, each with `error`, `file`, "
+    "`line`, `column`, `key`, `cure`; and `notes`, such as where the log of an interrupted run is."
 )
 _BOUNDS = {
     "minimum": "at least",
