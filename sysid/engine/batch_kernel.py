@@ -19,8 +19,8 @@ EACH_LANE = f"for l in range({LANES}):"
 
 
 class BatchKernel(Scheme):
-    """Text of the batch kernels; needs math, np, wide_vectors, the program and what
-    is compiled once for all models, ``scheme_matrices`` and ``fastest_rate``.
+    """Text of the batch kernels; needs math, wide_vectors, the program and what
+    is compiled once for all models, ``scheme_matrices`` and ``parts``.
 
     ``simulate`` runs lanes of chromosomes over a record, ``spectrum`` bounds the fastest rate
     of what is not integrated exactly. The work area holds rows of lanes: states, constants, sums
@@ -93,9 +93,9 @@ class BatchKernel(Scheme):
             *[f"{at(self._sums + j)} = 0.0" for j in range(2 * self.n_outputs)],
             *self.fill(),
         ]
-        lines = [f"A = np.zeros(({len(self.closure)}, {LANES}))", *block(EACH_LANE, lane)]
+        lines = [f"A = zeros({len(self.closure)}, {LANES})", *block(EACH_LANE, lane)]
         if self.n_entries:
-            lines.append(f"scheme_matrices(A, np.full({LANES}, h), *tables, rows)")
+            lines.append(f"scheme_matrices(A, filled({LANES}, h), *tables, rows)")
         return lines
 
     def _all_lanes(self, paired: bool) -> list[str]:
@@ -189,10 +189,10 @@ class BatchKernel(Scheme):
             *block("for k in range(u.shape[0]):", at_sample),
         ]
         body = [
-            f"J = np.empty(({n}, {n}))",
-            f"T = np.empty(({n}, {n}))",
-            f"X = np.empty({self.n_states})",
-            f"N = np.empty({n})",
+            f"J = zeros({n}, {n})",
+            f"T = zeros({n}, {n})",
+            f"X = filled({self.n_states}, 0.0)",
+            f"N = filled({n}, 0.0)",
             *block("for l in range(rate.shape[0]):", lane),
         ]
         return "\n".join(block(head, body))

@@ -159,23 +159,21 @@ def _compiled(
 ) -> list[Any]:
     """Functions of kernels' text, compiled; called: the model's functions that it calls."""
     # Numba is slow to import.
-    from sysid.engine import intrinsics, vector_math
+    from sysid.engine import intrinsics, parts, vector_math
     from sysid.engine.phi import scheme_matrices
-    from sysid.engine.rate import fastest_rate
 
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
     scope = {
         "np": np,
         "math": vector_math,
         **{name: getattr(vector_math, name) for name in vector_math.OF_SLOPES},
-        "scheme_matrices": intrinsics.outside(scheme_matrices),
-        "fastest_rate": intrinsics.outside(fastest_rate),
         "wide_vectors": intrinsics.wide_vectors,
         "always_inline": intrinsics.always_inline,
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
         **{name: machine_code(function) for name, function in called.items()},
     }
     path = _define(f"{name}_{_key(text, called)}.py", text, scope)
+    scope |= {f.__name__: intrinsics.outside(f) for f in (scheme_matrices, *parts.PARTS)}
     for name in ("constants", "remainder", "observe", "margins", "gains"):
         if name in scope:
             scope[name] = _njit(scope[name], no_cpython_wrapper=True)
@@ -290,7 +288,7 @@ def _key(text: str, called: Mapping[str, Any]) -> str:
     import numba
 
     key = hashlib.sha256(f"{numba.__version__}\n{sorted(_OPTIONS['fastmath'])}\n{text}".encode())
-    for library in ("intrinsics.py", "phi.py", "rate.py", "straight_line.py", "vector_math.py"):
+    for library in ("intrinsics.py", "parts.py", "phi.py", "straight_line.py", "vector_math.py"):
         key.update(Path(__file__).with_name(library).read_bytes())
     for function in called.values():
         _fingerprint(function, key, set())

@@ -21,7 +21,8 @@ _COARSER = 2.0**-7
 
 
 class TrajectoryKernel(Scheme):
-    """Text of the kernels of one trajectory; needs math, np, scheme_matrices and the program.
+    """Text of the kernels of one trajectory; needs math, scheme_matrices, ``parts`` and the
+    program.
 
     ``levels`` fills a work area once per parameter vector, ``advance`` uses it.
     """
@@ -51,9 +52,9 @@ class TrajectoryKernel(Scheme):
             each = f"for l in range({LEVELS + 1}):"
             stored = f"X[{n + self.n_states} + l * {entries} + k] = rows[k, l]"
             body += [
-                f"A = np.zeros(({len(self.closure)}, {LANES}))",
-                f"H = np.zeros({LANES})",
-                f"rows = np.empty(({entries}, {LANES}))",
+                f"A = zeros({len(self.closure)}, {LANES})",
+                f"H = filled({LANES}, 0.0)",
+                f"rows = zeros({entries}, {LANES})",
                 *block(each, ["H[l] = h * 0.5 ** l"], self.fill()),
                 "scheme_matrices(A, H, *tables, rows)",
                 *block(each, block(f"for k in range({entries}):", [stored])),

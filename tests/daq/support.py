@@ -153,7 +153,7 @@ import gc, importlib.metadata, json, os, signal, sys, traceback
 import daq.cli, daq.cli.app, daq.figures.findings, daq.identification.comparison
 import daq.identification.fit, daq.identification.replay, daq.recording.preview, daq.serial.backend
 import matplotlib.figure, numba, pandas, pint, pydantic.type_adapter, rich.progress, rich.table
-import scipy.interpolate, sim_rig.actuator, sim_rig.backend, sysid.engine.rate
+import scipy.interpolate, sim_rig.actuator, sim_rig.backend, sysid.engine.parts
 import sysid.engine.phi, sysid.gassi, sysid.judging.alternatives
 for protocol in importlib.metadata.entry_points(group="rig.protocols"):
     protocol.load()

@@ -1,6 +1,8 @@
-"""The fastest rate of equations, compiled once for all models."""
+"""What the kernels of all models need, compiled once."""
 
 import math
+
+import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.intrinsics import shared
@@ -40,3 +42,18 @@ def fastest_rate(J: FloatArray, T: FloatArray) -> float:
                 T[i, j] = t
         J, T = T, J
     return math.exp(exponent)
+
+
+@shared("f8[:, ::1](i8, i8)")
+def zeros(rows: int, columns: int) -> FloatArray:
+    """A table of zeros."""
+    return np.zeros((rows, columns))
+
+
+@shared("f8[::1](i8, f8)")
+def filled(n: int, value: float) -> FloatArray:
+    """A row of n times a value."""
+    return np.full(n, value)
+
+
+PARTS = (fastest_rate, zeros, filled)
