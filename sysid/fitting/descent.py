@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.objective import Objective
+from sysid.fitting.objective import FLOORS, Objective
 from sysid.fitting.quadratic import FIRST_DAMPING, heavier
 from sysid.problem.space import SearchSpace
 
@@ -20,8 +20,6 @@ from sysid.problem.space import SearchSpace
 # something switches (dry friction, an overflow) the instant of switching moves in steps of the
 # integration, and only a larger perturbation shows what it depends on.
 PERTURBATIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-# Floors below which outputs' errors are smoothed, in parts of the error.
-FLOORS = (1e-1, 1e-2, 1e-3)
 TOLERANCE = 1e-7  # share of the error that ends a descent where nothing else is said
 PATIENCE = 3  # failures in a row, the later ones with more damping
 NOTHING = 1e-3  # share of the error that is not worth a change of perturbations
@@ -170,6 +168,8 @@ def sharpen(objective: Objective, descent: Descent) -> Descent | None:
     Descents stop on the crease that the error has where an output is explained exactly, so they
     approach it smoothed.
     """
+    if objective.smooth:
+        return None
     rms = descent.point.rms
     assert rms is not None
     below = np.any(rms[objective.weights > 0.0] < descent.floor)

@@ -25,6 +25,8 @@ from sysid.problem.data import Dataset, output_scale
 from sysid.problem.model import ModelError
 from sysid.problem.space import SearchSpace
 
+# Floors below which outputs' errors are smoothed, in parts of the error.
+FLOORS = (1e-1, 1e-2, 1e-3)
 # Whether records count by their samples or each alike.
 Balance = Literal["samples", "logs"]
 
@@ -44,6 +46,11 @@ class Responses:
     rms: FloatArray
     excess: FloatArray
 
+    def joined(self, more: Responses) -> Responses:
+        """Errors of these and of more chromosomes, without residuals."""
+        rms = np.concatenate([self.rms, more.rms])
+        return Responses(self.values[..., :0], rms, np.concatenate([self.excess, more.excess]))
+
 
 def smoothed(rms: FloatArray, floor: float) -> FloatArray:
     """Root mean squares, those below the floor f by the parabola (r^2 / f + f) / 2.
@@ -60,7 +67,10 @@ class Objective:
     Several records count as one long one, or with ``balance`` "logs" each alike: the mean under
     the root is then one of the records' means. ``weights``: (n_outputs,), relative importance of
     the outputs, default equal. ``scales``: divisors of the residuals, per record (n_outputs,):
-    max|y|, times a factor that balances the records. ``given``: (n, n_parameters), independent
+    max|y|, times a factor that balances the records. ``smooth``: whether outputs' errors stay
+    smoothed by the first of ``FLOORS``, as where weights go by the errors: what is below it is an
+    output that is explained too well to decide, and a crease would only lead descents astray.
+    ``given``: (n, n_parameters), independent
     changes of the fixed parameters, one standard deviation each, which the intervals count.
     """
 
@@ -90,6 +100,7 @@ class Objective:
         if len(unseen):
             name = simulator.model.output_names[unseen[0]]
             raise ModelError(f"no record has a measured sample of output {name!r}")
+        self.smooth = False
         self._counter = [0]
 
     @property
@@ -107,7 +118,7 @@ class Objective:
 
     def weighed(self, weights: FloatArray) -> Self:
         """The same objective with other weights of the outputs, (n_outputs,)."""
-        return self._with(weights=weights / weights.sum())
+        return self._with(weights=weights / weights.sum(), smooth=True)
 
     def on(self, records: Sequence[Dataset], places: Sequence[int] | None = None) -> Objective:
         """The same objective, scales included, on parts of its records.
@@ -198,7 +209,8 @@ class Objective:
     def least_squares_weights(self, residual: FloatArray) -> FloatArray:
         """Weights (n_outputs,) of squares whose mean is least where the error is, by residuals."""
         counts, rms = np.maximum(self.counts, 1), self._roots(np.sum(residual**2, axis=0))
-        weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, 1e-12)
+        floor = max(FLOORS[0] * float(self.weights @ rms) if self.smooth else 0.0, 1e-12)
+        weights: FloatArray = self.weights * len(residual) / counts / np.maximum(rms, floor)
         return weights
 
     def in_units(self, residual: FloatArray) -> FloatArray:

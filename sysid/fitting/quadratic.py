@@ -23,6 +23,8 @@ quadratic promises to gain is the share -(g'd + d'H d / 2) / E_f. Steps and slop
 the ranges.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -48,11 +50,16 @@ _SHORTENINGS, _SHORTER = 6, 0.4
 
 @dataclass(frozen=True)
 class Quadratic:
-    """H (n_free, n_free), g (n_free,) and the smoothed error E_f at the point."""
+    """H (n_free, n_free), g (n_free,) and the smoothed error E_f at the point.
+
+    factors: c, (n_outputs,). distance: (n_free,), of the neighbours.
+    """
 
     hessian: FloatArray
     gradient: FloatArray
     error: float
+    factors: FloatArray
+    distance: FloatArray
 
     @classmethod
     def at(
@@ -69,7 +76,8 @@ class Quadratic:
                 changes = np.where(np.isfinite(changes), changes, 0.0)
                 hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
             hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
-        return cls(hessian, gradient, float(smoothed(rms, floor) @ weights))
+        error = float(smoothed(rms, floor) @ weights)
+        return cls(hessian, gradient, error, c, distance)
 
     @property
     def leads_somewhere(self) -> bool:
@@ -101,6 +109,13 @@ class Candidates:
     coordinates: FloatArray
     damping: FloatArray
     promise: float
+
+    def joined(self, more: Candidates) -> Candidates:
+        """These and more of the same point."""
+        coordinates = np.concatenate([self.coordinates, more.coordinates])
+        return replace(
+            self, coordinates=coordinates, damping=np.concatenate([self.damping, more.damping])
+        )
 
 
 def candidates(
@@ -149,6 +164,45 @@ def candidates(
         Candidates(coordinates[k, :-1][kept[k]], lighter[k, :-1][kept[k]], promise)
         for k, promise in enumerate(promises.max(axis=1).tolist())
     ]
+
+
+def bent(
+    objective: Objective,
+    at: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    quadratic: Quadratic,
+    offer: Candidates,
+    responses: tuple[Responses, Responses],
+) -> Candidates:
+    """Candidates from a point (n_free,) bent by what the errors at their ends are not linear by.
+
+    responses: those around the point, and those of the candidates. With s_j = e_j(d) - e_j - J_j d
+    a step d goes on by the solution of (H + lambda D) b = -sum_j c_j J_j' s_j (Transtrum & Sethna,
+    "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization",
+    arXiv:1201.5885, by a finite step). In a narrow valley that bends, straight steps are short.
+    """
+    around, ends = responses
+    space, (lower, upper) = objective.space, bounds
+    values, counted = around.values, np.flatnonzero(objective.weights > 0.0)
+    slopes = np.zeros((len(offer.coordinates), len(at)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for j in counted:
+            change = (ends.values[:, j] - values[:, j, :1]).T
+            slopes += quadratic.factors[j] * (change @ (values[:, j, 1:] - values[:, j, :1]))
+        steps = (offer.coordinates - at) / space.width
+        slopes = slopes / quadratic.distance - steps @ quadratic.hessian
+    diagonal = np.diag(quadratic.hessian)
+    scale = np.maximum(diagonal, 1e-12 * diagonal.max())
+    added = np.sqrt(_FACTORS[-1]) * offer.damping[:, None] * scale
+    free = (offer.coordinates > lower) & (offer.coordinates < upper)
+    systems = np.where(free[:, :, None] & free[:, None], quadratic.hessian, 0.0)
+    places = np.arange(len(at))
+    systems[:, places, places] += np.where(free, added, 1.0)
+    moves = _solved(systems, np.where(free, -slopes, 0.0))
+    coordinates = np.clip(offer.coordinates + moves * space.width, lower, upper)
+    kept = np.flatnonzero(np.isfinite(coordinates).all(axis=1))
+    kept = kept[~_infeasible(space, coordinates[kept])]
+    return replace(offer, coordinates=coordinates[kept], damping=offer.damping[kept])
 
 
 def heavier(damping: float) -> float:

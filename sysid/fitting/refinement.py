@@ -1,6 +1,6 @@
 """Local refinement: Levenberg-Marquardt descents, several in one batch of simulations.
 
-An iteration of a descent at x, in search coordinates, takes two batches of simulations:
+An iteration of a descent at x, in search coordinates, takes two or three batches of simulations:
 
     1. x and its neighbours x + h_k e_k give the quadratic around x (see ``quadratic``): its
        Hessian H, slope g, and the share of the error that it promises to take away.
@@ -25,7 +25,6 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import (
-    FLOORS,
     FREE,
     NOTHING,
     PATIENCE,
@@ -36,13 +35,14 @@ from sysid.fitting.descent import (
     Restriction,
     resumed,
 )
-from sysid.fitting.objective import Objective, Responses
-from sysid.fitting.quadratic import CANDIDATES, Candidates, Quadratic, candidates, heavier
+from sysid.fitting.objective import FLOORS, Objective, Responses
+from sysid.fitting.quadratic import CANDIDATES, Candidates, Quadratic, bent, candidates, heavier
 from sysid.problem.space import SearchSpace
 
 MOST_ITERATIONS = 50
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
 _KEPT = 0.02  # share of the promise below which a gain counts as a failure
+_LITTLE = 0.5  # share of the promise below which the valley bends
 _FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
 _BURST = 10.0  # a neighbour's error that is so much larger has left the edge of stability
 _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
@@ -144,7 +144,7 @@ def errors_of(objective: Objective, descents: Sequence[Descent]) -> FloatArray:
 
 def simulations_per_iteration(objective: Objective) -> int:
     """Most simulations that an iteration of one descent takes."""
-    return 3 + len(objective.space.parameters) + CANDIDATES
+    return 3 + len(objective.space.parameters) + 2 * CANDIDATES
 
 
 def curvature(objective: Objective, at: FloatArray) -> FloatArray:
@@ -190,9 +190,25 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
         else:
             onward[i] = resumed(objective, onward[i], "arrived")
     rows = [offer.coordinates for offer in offers.values()]
-    tried = _responses(objective, [onward[i] for i in offers], rows, keep=False)
-    for (i, offer), responses in zip(offers.items(), tried, strict=True):
-        onward[i] = _judged(objective, onward[i], offer, responses)
+    tried = dict(zip(offers, _responses(objective, [onward[i] for i in offers], rows), strict=True))
+    curved = {
+        i: bent(
+            objective,
+            onward[i].point.at,
+            onward[i].restriction.bounds(space),
+            quadratics[i],
+            offer,
+            (around[i], tried[i]),
+        )
+        for i, offer in offers.items()
+        if _gains(objective, onward[i], tried[i]).max() < _LITTLE * offer.promise
+    }
+    rows = [offer.coordinates for offer in curved.values()]
+    again = _responses(objective, [onward[i] for i in curved], rows, keep=False)
+    for i, responses in zip(curved, again, strict=True):
+        offers[i], tried[i] = offers[i].joined(curved[i]), tried[i].joined(responses)
+    for i, offer in offers.items():
+        onward[i] = _judged(objective, onward[i], offer, tried[i])
     return onward
 
 
@@ -235,11 +251,10 @@ def _surveyed(
 
 def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Responses) -> Descent:
     """The descent after its candidates have been simulated, at the best of them if it gains."""
-    assert descent.point.rms is not None and descent.steps_at is not None
-    rms = np.stack([descent.point.rms, *ends.rms])
-    before, *errors = objective.smoothed_error_of(rms, descent.floor).tolist()
-    best = int(np.argmin(errors))
-    gain = (before - errors[best]) / before
+    assert descent.steps_at is not None
+    gains = _gains(objective, descent, ends)
+    best = int(np.argmax(gains))
+    gain = float(gains[best])
     damping = heavier(descent.damping)
     if gain > 0.0:
         at, damping = offer.coordinates[best], float(offer.damping[best])
@@ -257,6 +272,15 @@ def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Res
     if failures >= PATIENCE or 0.0 < gain <= descent.tolerance:
         return resumed(objective, descent, "arrived")
     return descent
+
+
+def _gains(objective: Objective, descent: Descent, ends: Responses) -> FloatArray:
+    """Shares of the smoothed error, (n,), that candidates take away."""
+    assert descent.point.rms is not None
+    rms = np.stack([descent.point.rms, *ends.rms])
+    errors = objective.smoothed_error_of(rms, descent.floor)
+    gains: FloatArray = (errors[0] - errors[1:]) / errors[0]
+    return gains
 
 
 def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:

@@ -15,7 +15,7 @@ from sysid.uncertainty.ties import ties
 
 _HALVINGS = 4  # of a slide that a curved tie does not allow
 _ITERATIONS = 15  # back onto a curved tie
-_WORSE = 1e-5  # share of the error
+_WORSE, _NO_BETTER = 1e-5, 1e-6  # shares of the error
 
 
 def slid(objective: Objective, chromosome: FloatArray, error: float) -> Refinement | None:
@@ -32,7 +32,9 @@ def slid(objective: Objective, chromosome: FloatArray, error: float) -> Refineme
     slide = _to_the_middle(space, at, tied.directions)
     for halving in range(_HALVINGS):
         start = np.clip(at + 0.5**halving * slide, *space.coded_bounds)
-        end = refine(objective, space.decode(start), max_iterations=_ITERATIONS)
+        end = refine(
+            objective, space.decode(start), max_iterations=_ITERATIONS, tolerance=_NO_BETTER
+        )
         if (
             end.error <= (1.0 + _WORSE) * error
             and not (space.on_bound(end.chromosome) & on_end).any()
