@@ -28,6 +28,8 @@ _OFF_COUNT = 0.05  # counts that a printed angle may be off a whole one
 _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
 _CREDIBLE = 0.85, 1.2  # change of the speed within an interval that its neighbour can tell
 _FEWEST, _SHARE = 3, 0.8  # of the intervals that can be checked, those that must agree
+# Samples of a mean of zero for which it does not matter when exactly its edges were.
+_REST = 20.0
 _MANY = 20  # intervals that contradict what somebody says
 
 
@@ -86,9 +88,15 @@ class _Intervals:
         end[timed[agreeing]] = 0.5 * (low + high)[agreeing]
         slack[timed[agreeing]] = 0.5 * np.maximum(high - low, 0.0)[agreeing]
         begin = np.where(rate == 0.0, np.append(earliest[0], end[:-1]), end - length)
-        # A turn shows as a speed of zero. Amid several edges nothing tells when the one before was.
-        lone = (np.abs(np.diff(counts[rows], prepend=np.nan)) == 1.0) & (_faster(rate) < 1.0)
-        rate = np.where((rate == 0.0) & ~lone, np.nan, rate)
+        # A turn shows as a speed of zero, back over the edge before. Amid several edges nothing
+        # tells when that was; nor, where the count goes on, how often the shaft has turned.
+        change = np.diff(counts[rows], prepend=np.nan)
+        back = (np.abs(change) == 1.0) & (np.diff(change, prepend=np.nan) == 2.0 * change)
+        # Of one turn after the other nothing tells how fast the shaft passed the edges.
+        still = rate == 0.0
+        again = still & (np.append(False, still[:-1]) | np.append(still[1:], False))
+        told = back & (_faster(rate) < 1.0) & (~again | (end - begin >= _REST))
+        rate = np.where(still & ~told, np.nan, rate)
         return cls(rows, rate, begin, end, slack, len(timed), int(agreeing.sum()))
 
     def show_edges(self, stated: bool) -> bool:

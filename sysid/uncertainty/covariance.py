@@ -18,6 +18,7 @@ from sysid.uncertainty.sensitivity import (
     Sensitivity,
     input_noises,
     noise_pushes,
+    parabola_errors,
     spans,
     start_errors,
     zero_errors,
@@ -100,8 +101,8 @@ def covariance(
     score = score_covariance(weighted, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = _larger(score, _score_covariance_by_inputs(sensitivity, weighted))
-    for errors in (zero_errors(sensitivity), start_errors(sensitivity)):
-        score += _score_covariance_by(weighted, errors)
+    for errors in (zero_errors, start_errors, parabola_errors):
+        score += _score_covariance_by(weighted, errors(sensitivity))
     pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, slopes.shape[2])
     score += pushes.T @ pushes
     rows = (slopes * np.sqrt(weight)[:, None]).reshape(-1, slopes.shape[2])

@@ -9,6 +9,7 @@ from scipy.special import ndtr
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.innovations import Innovations
+from sysid.fitting.means import as_parabolas
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.uncertainty.colour import record_rows
@@ -184,6 +185,22 @@ def start_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
             outputs[0, j] += record.sample_noise(j, left[:, j])
             change = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
             yield change * sensitivity.share
+
+
+def parabola_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+    """Change (n_residuals, n_outputs) by what averaged outputs are but no parabola.
+
+    It repeats itself with the inputs, so that more samples do not average it away.
+    """
+    objective, change = sensitivity.objective, np.zeros_like(sensitivity.residual)
+    simulator, space = objective.simulator, objective.space
+    chromosomes = sensitivity.chromosome[None]
+    vector = space.full(chromosomes)[0]
+    for k, record in enumerate(objective.records):
+        start = space.starts(chromosomes, k, record.initial_state(simulator.model))[0]
+        otherwise = as_parabolas(simulator, record, vector, start)
+        change += _change_by_record(sensitivity, k, otherwise) * sensitivity.share
+    yield change
 
 
 def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]:

@@ -77,6 +77,20 @@ def test_speeds_are_the_means_over_their_windows(angle, error, at_samples):
     assert np.sqrt(np.mean((omega - exactly) ** 2)) > at_samples
 
 
+def dithering(t):
+    # Over one edge and back, 40 times a second from half a second on.
+    return np.where(t < 0.5, 0.4 * (t - 0.5), 0.3 * COUNT * np.sin(80.0 * np.pi * (t - 0.5)))
+
+
+def test_of_one_turn_after_the_other_nothing_is_measured():
+    """The device shows zero; when the edges were is known to a sample, of a handful."""
+    tick, theta, omega = logged(dithering, 1.2)
+    values = mean_speeds(tick, theta, omega, DT, COUNT).values
+    later = tick * DT > 0.55
+    assert (omega[later] == 0.0).all() and np.isnan(values[later][:-20]).all()
+    assert np.isfinite(values[tick * DT < 0.45]).mean() > 0.99
+
+
 @pytest.mark.parametrize("angle", [swinging, creeping])
 def test_its_jitter_says_how_far_a_mean_may_be_off(angle):
     """Each error in parts of what the jitter makes of the true acceleration is about one."""

@@ -103,7 +103,7 @@ def test_the_budget_is_kept_and_the_end_is_a_minimum():
     )
     fitted = GASSI(motor(), population=100, generations=20, criterion="error").fit(record)
     assert 0.85 * 2000 < fitted.n_simulations_ <= 2000
-    assert len(fitted.history_) in (19, 20)
+    assert len(fitted.history_) in (18, 19, 20)
     assert np.all(np.diff(fitted.history_) <= 1e-12)
     assert fitted.history_[-1] == fitted.error_
     again = refine(objective(motor(), record), fitted.chromosome_)

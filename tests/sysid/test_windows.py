@@ -7,10 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid import GASSI, BatchSimulator, Dataset, ModelError
+from sysid import (
+    GASSI,
+    BatchSimulator,
+    Dataset,
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    State,
+)
 from sysid.engine.filter_kernel import FilterKernel
 from sysid.examples import lag
-from sysid.fitting.means import each_mean_once, scatter
+from sysid.fitting.means import as_parabolas, each_mean_once, scatter
 
 DT, TAU = 1e-3, 0.05
 N = 300
@@ -190,3 +200,26 @@ def test_jitter_that_can_be_none_is_refused(jitter):
 def test_windows_that_fit_no_outputs_are_refused(windows, problem):
     with pytest.raises(ModelError, match=problem):
         Dataset(np.ones(5), np.zeros(5), DT, windows=windows)
+
+
+def test_a_mean_as_if_of_a_parabola_is_off_by_what_a_cubic_has_beside_it():
+    """Behind a step of the jerk the output is u s^3 / 6, a parabola (3 s^2 - s) u / 12."""
+    model = ProcessModel(
+        name="jerk",
+        states=(State("y", "1"), State("v", "1/s"), State("a", "1/s^2")),
+        inputs=(Input("u", "1/s^3"),),
+        outputs=(Output("y", "1"),),
+        parameters=(Parameter("gain", "1", 1.0, 0.1, 10.0),),
+        derivative=lambda x, u, p: (x[1], x[2], p[0] * u[0]),
+    )
+    begin, end = -0.3, -0.1
+    windows = np.tile([begin, end], (4, 1, 1))
+    record = Dataset(np.full(4, 6.0), np.zeros(4), 1.0, windows=windows)
+    otherwise = as_parabolas(BatchSimulator(model), record, np.ones(1), np.zeros(3))
+    a, b = 1.0 + begin, 1.0 + end
+    cubic = (b**4 - a**4) / 4.0
+    parabola = (b**3 - a**3) / 2.0 - (b**2 - a**2) / 4.0
+    # The part of a cubic that is none is the same in every sample.
+    np.testing.assert_allclose(
+        otherwise.outputs[1:, 0], np.full(3, (parabola - cubic) / (b - a)), rtol=1e-2
+    )
