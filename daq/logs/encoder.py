@@ -38,7 +38,7 @@ class MeanSpeeds:
     """Speeds as means over known times.
 
     values: (n,) [rad/s], NaN for samples between edges of which none was timed, and where the
-    shaft turned round amid several edges of a sample. windows: (n, 2),
+    shaft turned round amid several edges of a sample, or time and again. windows: (n, 2),
     begin and end of what each is the mean over [s], from its sample on. jitter: (n,), standard
     deviations of when they were [s].
     """
@@ -93,10 +93,10 @@ class _Intervals:
         change = np.diff(counts[rows], prepend=np.nan)
         back = (np.abs(change) == 1.0) & (np.diff(change, prepend=np.nan) == 2.0 * change)
         # Of one turn after the other nothing tells how fast the shaft passed the edges.
-        still = rate == 0.0
-        again = still & (np.append(False, still[:-1]) | np.append(still[1:], False))
-        told = back & (_faster(rate) < 1.0) & (~again | (end - begin >= _REST))
-        rate = np.where(still & ~told, np.nan, rate)
+        turns = rate == 0.0
+        repeated = turns & (np.append(False, turns[:-1]) | np.append(turns[1:], False))
+        measured = back & (_faster(rate) < 1.0) & (~repeated | (end - begin >= _REST))
+        rate = np.where(turns & ~measured, np.nan, rate)
         return cls(rows, rate, begin, end, slack, len(timed), int(agreeing.sum()))
 
     def show_edges(self, stated: bool) -> bool:
