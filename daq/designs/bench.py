@@ -27,7 +27,7 @@ _ASTRAY = 0.05  # of the noise, by which a model may err where it is right
 _TURNS = 0.15  # of the samples, to which a shaft may turn round for torque and edges to tell why
 _BETWEEN = 0.5  # of a speed's noise or of what its edges make, by which it may err in that
 _ACCURACY = 1e-2  # of the plant, beside which margins are wide
-_FINER = 4  # times the steps that commands need, at most, where an amplifier ends
+_FINER = 1, 2, 4  # times the steps that commands need, where an amplifier ends
 
 
 class PlantBench:
@@ -95,9 +95,9 @@ class PlantBench:
         """
         if not self._commands_allowed(inputs, dt):
             return None
-        steps = self._finer(inputs, dt, vectors)
         # What refuses most is computed first.
-        if self._astray(inputs, dt, vectors[:1], steps[:1]).any():
+        steps, larger = self._finer(inputs, dt, vectors)
+        if self._leads_astray(inputs, dt, vectors[0], larger, int(steps[0])):
             self.strays += 1
             return None
         signals: dict[str, FloatArray] = {}
@@ -111,7 +111,7 @@ class PlantBench:
         others = np.arange(1, min(_FOLLOWED, len(vectors)))
         if not self._identified:  # of wide ranges the slow ones are soon computed
             others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
-        astray = self._astray(inputs, dt, vectors[others], steps[others])
+        astray = self._astray(inputs, dt, vectors[others], int(steps[others].max(initial=1)))
         moves = [{name: s[place] for name, s in signals.items()} for place in (0, *others)]
         struck = np.array([not self._accelerates(inputs, dt, of_it) for of_it in moves], dtype=bool)
         at_most = 0.0 if self._identified else _MINORITY * (1 + len(others))
@@ -124,7 +124,8 @@ class PlantBench:
 
         vectors: (n, n_parameters), of the model's parameters.
         """
-        return self._run(inputs, dt, vectors, int(self._finer(inputs, dt, vectors).max()))
+        steps, _ = self._finer(inputs, dt, vectors)
+        return self._run(inputs, dt, vectors, int(steps.max()))
 
     def _run(
         self, inputs: FloatArray, dt: float, vectors: FloatArray, n_steps: int
@@ -132,6 +133,10 @@ class PlantBench:
         """As ``signals``, by so many integration steps per sample."""
         values, record = self._of_plant(vectors), self._driven(inputs, dt)
         outputs = self._simulator.trajectories(values, record, n_steps)
+        return self._named(outputs)
+
+    def _named(self, outputs: FloatArray) -> dict[str, FloatArray]:
+        """The plant's outputs (n, n_samples, n_outputs) by name."""
         names = self._simulator.model.output_names
         return {name: outputs[:, :, j] for j, name in enumerate(names)}
 
@@ -168,15 +173,22 @@ class PlantBench:
                 self._steps_of[key] = np.minimum(steps, most)
             return self._steps_of[key]
 
-    def _finer(self, inputs: FloatArray, dt: float, vectors: FloatArray) -> IntArray:
+    def _finer(
+        self, inputs: FloatArray, dt: float, vectors: FloatArray
+    ) -> tuple[IntArray, dict[str, FloatArray]]:
         """Steps of each of the vectors in a run, (n,): no fewer than the likeliest needs there.
 
-        An amplifier that comes to its end needs more of them than a step of the commands.
+        An amplifier that comes to its end needs more of them than a step of the commands. With
+        them what the likeliest does at commands that are larger by the margin, as of ``signals``.
         """
         steps, likeliest = self._steps(dt, vectors), self._of_plant(vectors[:1])
         larger = self._driven(self._scale * inputs, dt)
-        needed = int(self._simulator.steps_of_each(likeliest, larger)[0])
-        return np.maximum(steps, min(needed, _FINER * int(steps[0])))
+        for finer in _FINER:
+            n_steps = finer * steps[:1]
+            run = self._simulator.residuals(likeliest, [larger], [None], n_steps[None], [None])
+            if run.excess[0, 0] <= 1.0:
+                break
+        return np.maximum(steps, n_steps), self._named(np.moveaxis(run.values, 2, 0))
 
     def _commands_allowed(self, inputs: FloatArray, dt: float) -> bool:
         plan = Plan(len(inputs), inputs.min(axis=0), inputs.max(axis=0), inputs)
@@ -187,24 +199,36 @@ class PlantBench:
         return True
 
     def _astray(
-        self, inputs: FloatArray, dt: float, vectors: FloatArray, steps: IntArray
+        self, inputs: FloatArray, dt: float, vectors: FloatArray, n_steps: int
     ) -> npt.NDArray[np.bool_]:
-        """Whether the plant does what the model does not, or what its encoder does not tell, (n,).
+        """Which of several vectors lead the model astray, (n,)."""
+        signals = self._run(self._scale * inputs, dt, vectors, n_steps)
+        of_each = [{name: s[k : k + 1] for name, s in signals.items()} for k in range(len(vectors))]
+        astray = [
+            self._leads_astray(inputs, dt, vector, larger, n_steps)
+            for vector, larger in zip(vectors, of_each, strict=True)
+        ]
+        return np.array(astray, dtype=bool)
 
-        Or what would pass for hardware that fails. At commands that are larger by the margin, for
-        an amplifier ends at once.
+    def _leads_astray(
+        self,
+        inputs: FloatArray,
+        dt: float,
+        vector: FloatArray,
+        larger: Mapping[str, FloatArray],
+        n_steps: int,
+    ) -> bool:
+        """Whether the plant does what the model does not, or what its encoder does not tell.
+
+        Or what would pass for hardware that fails. larger: what it does at commands that are
+        larger by the margin, for an amplifier ends at once; each (1, n_samples).
         """
-        larger, n_steps = self._scale * inputs, int(steps.max(initial=1))
-        signals = self._run(larger, dt, vectors, n_steps)
-        astray = np.zeros(len(vectors), dtype=bool)
-        for k, vector in enumerate(vectors):
-            of_it = {name: values[k] for name, values in signals.items()}
-            astray[k] = not (
-                self._tells_speed(of_it["omega"])
-                and self._accelerates(larger, dt, of_it)
-                and self._follows(self._record(larger, dt, signals, k), vector, of_it, n_steps)
-            )
-        return astray
+        commands, of_it = self._scale * inputs, {name: values[0] for name, values in larger.items()}
+        return not (
+            self._tells_speed(of_it["omega"])
+            and self._accelerates(commands, dt, of_it)
+            and self._follows(self._record(commands, dt, larger, 0), vector, of_it, n_steps)
+        )
 
     def _tells_speed(self, omega: FloatArray) -> bool:
         """Whether the encoder tells a speed (n_samples,).

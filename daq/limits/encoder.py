@@ -138,15 +138,14 @@ class Drive:
             self._samples, self._pushes = samples, [self._push(*row) for row in rows]
         return self._pushes
 
-    def ratios(self, samples: Samples) -> FloatArray:
-        """Currents at work in parts of those that turn the shaft, (n,), of a block of samples."""
+    def of_block(self, samples: Samples) -> tuple[FloatArray, FloatArray]:
+        """Currents at work, and those that turn the shaft, each (n,), of a block of samples."""
         commanded = self._motor_gain * samples.applied_voltage_motor
         motor = samples.current_motor
         at_work = np.where(np.abs(commanded) > np.abs(motor), commanded, motor)
         of_command = self._brake_gain * np.abs(samples.applied_voltage_brake)
         against = np.maximum(np.abs(samples.current_brake), of_command)
-        ratios: FloatArray = at_work / (self._motor * (1.0 + against / self._brake))
-        return ratios
+        return at_work, self._motor * (1.0 + against / self._brake)
 
     def _push(self, motor: float, brake: float, volts_motor: float, volts_brake: float) -> Push:
         commanded = self._motor_gain * volts_motor
@@ -175,7 +174,8 @@ class Stalled(Limit):
             return self._standing(samples.theta.tolist(), each, 0)
         # A step of twice the flicker leaves any place of rest: what is before it is forgotten.
         left = np.flatnonzero(~(np.abs(np.diff(samples.theta)) <= 2.0 * self._flicker)) + 1
-        ratios = self._drive.ratios(samples)
+        at_work, needed = self._drive.of_block(samples)
+        ratios = at_work / needed
         strong = np.where(np.abs(ratios) >= 1.0, np.abs(ratios) * self._dt, 0.0)
         begins = np.concatenate([[0], left])
         most = np.add.reduceat(strong, begins)
@@ -272,6 +272,8 @@ class Acceleration(Limit):
         """Narrow down the speeds that are possible."""
         if not self._watching:
             return None
+        if len(samples.omega) >= _BLOCK and self._beyond == 0 and self._all_possible(samples):
+            return None
         columns = samples.tick.tolist(), samples.omega.tolist(), self._drive.of(samples)
         for row, (tick, omega, push) in enumerate(zip(*columns, strict=True)):
             self._current = max(abs(push.at_work) + push.needed, self._fading * self._current)
@@ -290,6 +292,26 @@ class Acceleration(Limit):
             if self._beyond >= _BEYOND:
                 return row, self._reason(omega, low, high)
         return None
+
+    def _all_possible(self, samples: Samples) -> bool:
+        """Whether no speed of a block is outside those possible, which are narrowed down then."""
+        at_work, needed = self._drive.of_block(samples)
+        faded = np.arange(1, len(at_work) + 1) * (self._dt / _LASTING)
+        with np.errstate(divide="ignore"):  # no current before the first sample
+            grown = np.log(np.append(self._current, np.abs(at_work) + needed))
+        grown[1:] += faded
+        currents = np.exp(np.maximum.accumulate(grown)[1:] - faded)
+        passed = np.diff(samples.tick, prepend=self._tick) * self._dt
+        change = np.cumsum(self._per_ampere * currents * passed)  # at most, since the block began
+        omega, margin = samples.omega, self._margin
+        low = np.maximum.accumulate(np.append(self._low, omega - margin + change))
+        high = np.minimum.accumulate(np.append(self._high, omega + margin - change))
+        above = low[:-1] - change - margin <= omega
+        possible = bool(np.all(above & (omega <= high[:-1] + change + margin)))
+        if possible:
+            self._low, self._high = low.item(-1) - change[-1], high.item(-1) + change[-1]
+            self._tick, self._current = samples.tick.item(-1), currents.item(-1)
+        return possible
 
     def _reason(self, omega: float, low: float, high: float) -> str:
         return (
