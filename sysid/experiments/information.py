@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import pinvh
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.engine.scheme import LANES
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.disturbance import with_disturbances
 from sysid.fitting.means import mean_of_sides
@@ -30,15 +31,16 @@ _PHANTOM = 1e-10
 _BURST = 1e3  # times its span, by which no output moves over the range of a parameter
 # Share of the largest scatter, of coordinates of like scatter, below which a direction has none.
 _LEAST, _TINY = 1e-9, 1e-300
-# Draws of the inputs' noise: they give a variance to within a third.
-_DRAWS = 16
 
 
 class Informant:
     """Computes what a record would tell of the parameters.
 
     noise: (n_outputs,), standard deviations of the outputs' errors, infinite for one that does not
-    count; input_noise: (n_inputs,), of the white noise on measured inputs.
+    count; input_noise: (n_inputs,), of the white noise on measured inputs. draws: of that noise, at
+    least; up to a block more. Where they are fewer than coordinates they leave directions without
+    noise: of the actuator's 19 in eight runs 16, 29 and 125 draws gave deviations of 0.75, 0.9 and
+    0.98 of those of 253 draws (geometric mean).
     """
 
     def __init__(
@@ -47,12 +49,14 @@ class Informant:
         space: SearchSpace,
         noise: FloatArray,
         input_noise: FloatArray,
+        draws: int = LANES,
     ) -> None:
         self._simulator, self._space, self._noise = simulator, space, noise
+        self._draws = draws
         self._noisy, self._input_noise = np.flatnonzero(input_noise), input_noise
         self._disturbed = simulator
         if len(self._noisy):
-            model = with_disturbances(simulator.model, self._noisy.tolist(), _DRAWS)
+            model = with_disturbances(simulator.model, self._noisy.tolist(), LANES)
             self._disturbed = BatchSimulator(model, threads=simulator.threads)
 
     def information(self, record: Dataset, chromosomes: FloatArray) -> FloatArray:
@@ -62,8 +66,13 @@ class Informant:
         failed.
         """
         n_free, unknown = len(self._space.index), self._unknown(record)
-        n_draws = _DRAWS if len(self._noisy) else 0
-        slopes = self._slopes(record, chromosomes, n_free, unknown, n_draws)
+        # Draws fill the block that coordinates leave, and blocks of their own.
+        n_draws = -(n_free + len(unknown)) % LANES if len(self._noisy) else 0
+        passes = [self._slopes(record, chromosomes, n_free, unknown, n_draws)]
+        while len(self._noisy) and n_draws < self._draws:
+            passes.append(self._slopes(record, chromosomes, 0, (), LANES, seed=len(passes)))
+            n_draws += LANES
+        slopes = np.concatenate(passes, axis=-1)
         outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
         slopes[self._burst(slopes[..., :n_free], outputs)] = np.nan
         errors = self.variances(record, outputs)
@@ -88,7 +97,7 @@ class Informant:
         """What draws of the inputs' noise do to the outputs, (n_samples, n_outputs, n_draws)."""
         if not len(self._noisy):
             return np.zeros((*record.outputs.shape, 0))
-        return np.asarray(self._slopes(record, chromosome[None], 0, (), _DRAWS)[0])
+        return np.asarray(self._slopes(record, chromosome[None], 0, (), LANES)[0])
 
     def _unknown(self, record: Dataset) -> list[int]:
         """Places of the states whose start a record does not tell."""
@@ -103,19 +112,21 @@ class Informant:
         unknown: Sequence[int],
         n_draws: int,
         n_steps: int | None = None,
+        seed: int = 0,
     ) -> FloatArray:
         """Tangents by search coordinates, unknown starts, and draws of the inputs' noise.
 
-        n_free: number of the coordinates, or 0 for none. (n, n_samples, n_outputs, n_free +
+        n_free: number of the coordinates, or 0 for none. seed: of the draws. (n, n_samples, n_outputs, n_free +
         n_unknown + n_draws).
         """
         simulator = self._disturbed if n_draws else self._simulator
         model, vectors = simulator.model, self._space.full(chromosomes)
         n, n_starts = len(vectors), len(unknown)
-        quiet = np.zeros((n, n_draws))
+        n_channels = LANES if n_draws else 0
+        quiet = np.zeros((n, n_channels))
         along = np.zeros((n, n_free + n_starts + n_draws, len(model.parameters)))
         along[:, :n_free, : vectors.shape[1]] = self._directions(chromosomes)[:, :n_free]
-        along[:, n_free + n_starts :, vectors.shape[1] :] = np.eye(n_draws)
+        along[:, n_free + n_starts :, vectors.shape[1] :] = np.eye(n_draws, n_channels)
         moved = np.zeros((*along.shape[:2], len(model.states)))
         moved[:, np.arange(n_starts) + n_free, unknown] = 1.0
         if n_steps is None:
@@ -123,7 +134,8 @@ class Informant:
         else:
             steps = np.full((n, 1), n_steps)
         places = self._noisy if n_draws else self._noisy[:0]
-        errors = np.random.default_rng(0).standard_normal((record.n_samples, len(places), n_draws))
+        shape = record.n_samples, len(places), n_channels
+        errors = np.random.default_rng(seed).standard_normal(shape)
         channels = (errors * self._input_noise[places, None]).reshape(record.n_samples, -1)
         with_errors = replace(
             record,

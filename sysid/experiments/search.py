@@ -147,13 +147,25 @@ class Search:
             moved[k] = rng.choice([nearby, rng.random(), rng.integers(2)], p=_MOVES)
         return moved
 
-    def revise(self, revised: Callable[[RunCandidate], RunCandidate]) -> None:
-        """Replace each candidate, the chosen ones included, by what is now known of it."""
+    def revise(
+        self,
+        revised: Callable[[RunCandidate], RunCandidate],
+        places: Sequence[int] | None = None,
+    ) -> None:
+        """Replace candidates, by default all of them, by what is now known of them."""
 
         def replaced(place: int) -> None:
             self.pool[place] = revised(self.pool[place])
 
-        self.workers.each(replaced, range(len(self.pool)))
+        self.workers.each(replaced, range(len(self.pool)) if places is None else places)
+
+    def settle(self, revised: Callable[[RunCandidate], RunCandidate]) -> None:
+        """Revise the chosen alone, and add runs as long as that leaves too little."""
+        settled: set[int] = set()
+        while not settled.issuperset(self.chosen):
+            self.revise(revised, sorted({*self.chosen} - settled))
+            settled.update(self.chosen)
+            self._greedily(np.array([candidate.information for candidate in self.pool]))
 
     def choose(self) -> None:
         """The best set that greed and exchanges lead to."""
@@ -171,8 +183,8 @@ class Search:
         return total
 
     def _greedily(self, stack: FloatArray) -> None:
-        """One run after the other, until there are enough or all targets are met."""
-        total = np.zeros_like(stack[0])
+        """One more run after the other, until there are enough or all targets are met."""
+        total = stack[self.chosen].sum(axis=0)
         while len(self.chosen) < self.most and not self.aim.met(total):
             self.chosen.append(int(np.argmin(self.aim.losses(total + stack))))
             total = total + stack[self.chosen[-1]]

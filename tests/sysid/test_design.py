@@ -18,6 +18,7 @@ from sysid import (
     State,
     design,
 )
+from sysid.experiments.bench import FreeRun
 from sysid.experiments.information import Informant
 from tests.sysid.support import blank
 
@@ -182,6 +183,26 @@ def test_runs_are_added_until_the_targets_are_met():
     assert len(hard.runs) == 4
     assert not hard.met
     assert [quantity.name for quantity in hard.quantities if not quantity.met] == ["tau"]
+
+
+def test_runs_are_added_where_those_chosen_tell_less_than_the_search_held():
+    class Sobering:
+        """Tells of a run that it knows already that its samples' instants err."""
+
+        def __init__(self):
+            self.free, self.asked = FreeRun(BatchSimulator(lag())), set()
+
+        def records(self, inputs, dt, vectors):
+            (record, *_) = self.free.records(inputs, dt, vectors)
+            errs = 0.01 if inputs.tobytes() in self.asked else 0.0
+            self.asked.add(inputs.tobytes())
+            return [replace(record, jitter=np.full((len(inputs), 1), errs))] * len(vectors)
+
+    shared = {"noise": NOISE, "targets": {"tau": 0.004}, "runs": 6, **QUICK}
+    easy = design(lag(), [SQUARE], **shared)
+    sobered = design(lag(), [SQUARE], bench=Sobering(), **shared)
+    assert len(easy.runs) < len(sobered.runs)
+    assert easy.met and sobered.met
 
 
 def test_what_no_experiment_tells_is_refused_with_what_would():
