@@ -116,8 +116,8 @@ class Informant:
     ) -> FloatArray:
         """Tangents by search coordinates, unknown starts, and draws of the inputs' noise.
 
-        n_free: number of the coordinates, or 0 for none. seed: of the draws. (n, n_samples, n_outputs, n_free +
-        n_unknown + n_draws).
+        n_free: number of the coordinates, or 0 for none. seed: of the draws. (n, n_samples,
+        n_outputs, n_free + n_unknown + n_draws).
         """
         simulator = self._disturbed if n_draws else self._simulator
         model, vectors = simulator.model, self._space.full(chromosomes)
