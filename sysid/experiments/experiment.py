@@ -197,21 +197,21 @@ def design(
         records = bench.records(excitation.signal(genes), excitation.dt, vectors)
         if records is None:
             return None
-        told = _information(by, records[:draws], robust)
-        return told if np.isfinite(told).all() else None
+        gained = _information(by, records[:draws], robust)
+        return gained if np.isfinite(gained).all() else None
 
     def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
-        told = expected(informant, excitation, genes)
-        if told is None:
+        gained = expected(informant, excitation, genes)
+        if gained is None:
             return None
-        if not all(map(tells_nothing_there, told, null)):
+        if not all(map(tells_nothing_there, gained, null)):
             phantoms.append(excitation.name)
             return None
-        return RunCandidate(excitation, genes, told)
+        return RunCandidate(excitation, genes, gained)
 
     def settled(candidate: RunCandidate) -> RunCandidate:
-        told = expected(exact, candidate.excitation, candidate.genes)
-        return candidate if told is None else replace(candidate, information=told)
+        gained = expected(exact, candidate.excitation, candidate.genes)
+        return candidate if gained is None else replace(candidate, information=gained)
 
     goals = np.array(list((targets or {}).values())) / Z95
     gradients = relative_gradients(wanted, space, robust)
