@@ -430,14 +430,15 @@ class _Regression:
     ) -> None:
         self.whitening = whitening
         white, target = whitening(columns), whitening(residual[..., None])
-        self._n, self._more = len(target), len(free)
+        self._n = len(target)
         self._basis, self._triangle = np.linalg.qr(np.vstack([white, np.diag(free)]))
-        self._coefficients = self._solved(self._padded(target)[:, 0])
-        self._residual = self._beyond(target)[:, 0]
+        within, beyond = self._split(target)
+        self._coefficients, self._residual = self._solved(within[:, 0]), beyond[:, 0]
         self._noises = [
             (whitening.rows_of(rows), whitening.of_record(rows, changes))
             for rows, changes in noises
         ]
+        self._noises_within = [self._basis[rows].T @ noise for rows, noise in self._noises]
         self.squares = float(self._residual[: self._n] @ self._residual[: self._n])
 
     def test(self, changes: FloatArray, one_sided: bool) -> _Result | None:
@@ -453,61 +454,77 @@ class _Regression:
         if not len(used):
             return None
         columns = white[:, used] / size[used]
-        beyond = self._beyond(columns)
-        left, values, right = np.linalg.svd(beyond, full_matrices=False)
-        new = values > _NEW
+        within, beyond = self._split(columns)
+        squares, axes = np.linalg.eigh(beyond.T @ beyond)
+        new = squares > _NEW**2
         if not new.any():
             return None
+        pushes = self._pushes(columns, within)
         if one_sided:
             from scipy.optimize import nnls  # slow, and seldom needed
 
             amplitudes = nnls(beyond, self._residual)[0]
-            best = beyond @ amplitudes
-            length = float(np.linalg.norm(best))
+            length = float(np.linalg.norm(beyond @ amplitudes))
             if length == 0.0:
                 return None
-            left, freedom = (best / length)[:, None], int(np.count_nonzero(amplitudes))
+            turn, freedom = (amplitudes / length)[:, None], int(np.count_nonzero(amplitudes))
         else:
-            left, freedom = left[:, new], int(new.sum())
-            amplitudes = right[new].T @ ((left.T @ self._residual) / values[new])
+            turn, freedom = axes[:, new] / np.sqrt(squares[new]), int(new.sum())
+            amplitudes = turn @ (turn.T @ (beyond.T @ self._residual))
+        left = beyond @ turn
         score = left.T @ self._residual
-        move = -self._solved(self._padded(columns @ amplitudes))
+        move = -self._solved(within @ amplitudes)
         whole = np.zeros(len(size))
         whole[used] = amplitudes / size[used]
         return _Result(
-            _log(float(chdtrc(freedom, self._statistic(left, score)))),
+            _log(float(chdtrc(freedom, self._statistic(left, score, turn.T @ pushes)))),
             whole,
             self._coefficients + move,
             move,
             min(float(score @ score) / max(self.squares, 1e-300), 1.0),
         )
 
-    def _statistic(self, left: FloatArray, score: FloatArray) -> float:
-        """The score's square in units of its covariance, in every direction the larger of three."""
+    def _statistic(self, left: FloatArray, score: FloatArray, pushes: FloatArray) -> float:
+        """The score's square in units of its covariance, in every direction the larger of three.
+
+        pushes: of the score by draws of the inputs' noise.
+        """
         rest = self._residual - left @ score
         terms = (left * rest[:, None])[: self._n]
         terms = terms.reshape(-1, self.whitening.n_outputs, len(score)).sum(axis=1)
         covariance = _long_run_covariance(terms - terms.mean(axis=0))
-        if self._noises:
-            # What the columns make of the noise is at right angles to what they leave.
-            pushes = np.hstack([left[rows].T @ noise for rows, noise in self._noises])
+        if pushes.size:
             covariance = _larger(covariance, pushes @ pushes.T)
         return float(score @ np.linalg.solve(_larger(covariance, np.eye(len(score))), score))
 
-    def _solved(self, padded: FloatArray) -> FloatArray:
-        """Coefficients of the columns that come closest to a padded column."""
-        solution: FloatArray = solve_triangular(self._triangle, self._basis.T @ padded)
+    def _pushes(self, columns: FloatArray, within: FloatArray) -> FloatArray:
+        """Scalar products of what is beyond the columns and the noise's changes, (k, n_draws).
+
+        What the regression's columns make of the noise is at right angles to what they leave.
+        """
+        pushes = [np.zeros((columns.shape[1], 0))]
+        for (rows, noise), noise_within in zip(self._noises, self._noises_within, strict=True):
+            part, push = columns[rows], -within.T @ noise_within
+            pushes.append(push + part.T @ noise if part.any() else push)
+        return np.hstack(pushes)
+
+    def _solved(self, within: FloatArray) -> FloatArray:
+        """Coefficients of the regression's columns from scalar products with its basis."""
+        solution: FloatArray = solve_triangular(self._triangle, within)
         return solution
 
-    def _padded(self, white: FloatArray) -> FloatArray:
-        """Whitened columns with rows for what is known beforehand added."""
-        return np.concatenate([white, np.zeros((self._more, *white.shape[1:]))])
+    def _split(self, white: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scalar products of whitened columns with the basis, and what it leaves of them.
 
-    def _beyond(self, white: FloatArray) -> FloatArray:
-        """What the regression's columns leave of others."""
-        padded = self._padded(white)
-        rest: FloatArray = padded - self._basis @ (self._basis.T @ padded)
-        return rest
+        The latter with rows for what is known beforehand. What is in one record alone is read there
+        alone.
+        """
+        rows = np.flatnonzero(white.any(axis=1))
+        first, end = (rows[0], rows[-1] + 1) if len(rows) else (0, 0)
+        within: FloatArray = self._basis[first:end].T @ white[first:end]
+        beyond: FloatArray = -(self._basis @ within)
+        beyond[first:end] += white[first:end]
+        return within, beyond
 
 
 def _larger(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -582,6 +599,8 @@ class _Whitening:
     def of_record(self, rows: slice, columns: FloatArray) -> FloatArray:
         """Those of one record, (n_samples, n_outputs, k), by its rows of the residuals."""
         _, q, k = columns.shape
+        if not columns.any():
+            return np.zeros((q * int(self.kept[rows].sum()), k))
         order = len(self.model.coefficients)
         flat = np.ascontiguousarray(columns).reshape(-1, k)
         past = sliding_window_view(flat, (order + 1) * q, axis=0)[::q].swapaxes(1, 2)
