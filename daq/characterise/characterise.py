@@ -163,8 +163,6 @@ def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> C
             if not done:
                 raise _nothing_to_tell(current)
             reason = "no run within the limits would tell more"
-            if "missing" not in done[-1].result:
-                _identify(done, request, watch, ends=True)
             break
         _change_mounting(current, request, done, ask)
         _run(current, done, watch)
@@ -172,11 +170,13 @@ def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> C
         done.append(current)
         write_page(root, done, "still running")
         reason = _end(request, done)
-    last = done[-1]
+    last, report = done[-1], root / "report" / "report.html"
+    if "missing" not in last.result or not report.exists():
+        _identify(done, request, watch, ends=True)
     page = write_page(root, done, reason)
     return Characterisation(
         root, tuple(done), tuple(last.intervals()), _spent(done), reason,
-        last.result["verdict"], page, root / "report" / "report.html",
+        last.result["verdict"], page, report,
     )  # fmt: skip
 
 

@@ -73,13 +73,13 @@ def test_what_the_model_may_lack_is_tested_at_the_end(finished):
 
 def test_what_was_done_is_not_done_again(finished, tmp_path):
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
-    last = rounds_of(tmp_path / "c")[-1]
-    shutil.rmtree(last.identification)
+    shutil.rmtree(tmp_path / "c" / "report")  # as a kill after the last identification leaves it
     logs = {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("log.csv")}
     done = rig("characterise", "--resume", "c", "--json", cwd=tmp_path, timeout=300)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["quantities"] == finished[1]["quantities"]
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("log.csv")} == logs
+    assert (tmp_path / "c" / "report" / "report.html").exists()
 
 
 def test_each_run_has_noise_of_its_own(finished):
