@@ -8,15 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.config.identification import Column, Columns, TimeColumn
+from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, IntArray
 from daq.identification.foreign import TIME_UNIT, ColumnMapping, read_foreign
 from daq.identification.selection import EVERYTHING, Selection
 from daq.logs import matlab
 from daq.logs.capture import LOG_NAME
+from daq.logs.columns import COLUMNS, ORIGINAL_COLUMNS
 from daq.logs.encoder import SPEED, MeanSpeeds
 from daq.logs.recording import Recording, end_of_run, log_path, read_record
 from daq.logs.recording import load as load_recording
+from daq.logs.table import column_names
 from daq.logs.time_base import refuse_rows, require_rows, time_base
 from daq.views import Shown
 from sysid.problem.data import Dataset
@@ -46,7 +50,7 @@ class LoggedRecord(Shown):
 
     measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``; None
     where that leaves none out. preparation: what was done to it before, None for nothing. merged:
-    files with columns of it.
+    files with columns of it. of_a_rig: whether it is a run's log, with all that a run logs.
     """
 
     dataset: Dataset
@@ -55,6 +59,7 @@ class LoggedRecord(Shown):
     measured: Dataset | None = None
     preparation: Preparation | None = None
     merged: tuple[Path, ...] = ()
+    of_a_rig: bool = False
 
     @property
     def headline(self) -> str:
@@ -87,13 +92,44 @@ def load(
     mapping: ColumnMapping | None,
     selection: Selection = EVERYTHING,
 ) -> LoggedRecord:
-    """One log as a record; ConfigError names the file, line and column of what is wrong."""
+    """One log as a record; ConfigError names the file, line and column of what is wrong.
+
+    mapping: of columns to signals; None for a rig's log, or a table of the signals by their names.
+    """
+    csv = log_path(path)
     try:
+        mapping = mapping or _by_name(csv, model)
         if mapping is not None:
-            return _foreign(log_path(path), model, mapping, selection)
+            return _foreign(csv, model, mapping, selection)
         return from_recording(load_recording(path), model, selection)
     except ModelError as error:
         raise ConfigError(str(error), file=path) from None
+
+
+def _by_name(csv: Path, model: ProcessModel) -> ColumnMapping | None:
+    """Of a table that has time ``t`` [s] and the model's signals by name; None for a rig's log.
+
+    Raises ConfigError for another program's without all of them.
+    """
+    present = column_names(csv) if csv.is_file() else ()
+    names = (*model.input_names, *model.output_names)
+    lacking = [name for name in ("t", *names) if name not in present]
+    of_a_rig = set(ORIGINAL_COLUMNS) <= set(present)
+    if not present or of_a_rig or (lacking and not set(names).isdisjoint(COLUMNS)):
+        return None
+    if lacking:
+        cure = (
+            f"it has {', '.join(present)}. Call columns t (in seconds) and as the model does, or "
+            "say which is which in the 'columns' section of a file given with --config"
+        )
+        problem = f"model {model.name} needs {', '.join(lacking)}, of which there is no column"
+        raise ConfigError(problem, cure=cure, file=csv, line=1)
+    inputs, outputs = (
+        {name: Column(column=name) for name in part}
+        for part in (model.input_names, model.output_names)
+    )
+    columns = Columns(time=TimeColumn(column="t"), inputs=inputs, outputs=outputs)
+    return ColumnMapping(YamlFile(csv, {}, {}), columns)
 
 
 def from_recording(
@@ -107,7 +143,7 @@ def from_recording(
     outputs = np.array([recording.noise(n) for n in model.output_names]).reshape(-1, 2).T
     calibrated = {"output_noise": outputs[0], "output_zero": outputs[1]}
     dataset = replace(dataset, input_noise=noise, input_zero=zero, **calibrated)
-    log = LoggedRecord(dataset, recording.path, recording.warning)
+    log = LoggedRecord(dataset, recording.path, recording.warning, of_a_rig=True)
     return _prepared(log, model, selection)
 
 

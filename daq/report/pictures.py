@@ -83,8 +83,8 @@ class Subject:
 
     @property
     def foreign(self) -> bool:
-        """Whether the logs are not the program's own captures."""
-        return bool(self.document["reproduction"]["columns"])
+        """Whether the first of the logs is not one of the program's own captures."""
+        return not self.training[0][0].of_a_rig
 
 
 def pictures(subject: Subject) -> Iterator[Picture]:

@@ -57,14 +57,16 @@ class Trace:
     __hash__ = object.__hash__
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
-        """A NumPy number on the left, or at a point NumPy's function of single numbers."""
+        """A NumPy number on the left, or NumPy's function of single numbers."""
         if method != "__call__" or options:
             return NotImplemented
         numbers = [a if isinstance(a, Trace) else float(a) for a in inputs]
         if ufunc in _ARITHMETIC:
             return _ARITHMETIC[ufunc](*numbers)
-        if ufunc in _AT_A_POINT and self.tape.single(map(operand, numbers)):
-            return _AT_A_POINT[ufunc](*numbers)
+        if ufunc in _FUNCTIONS:
+            return _FUNCTIONS[ufunc](*numbers)
+        if ufunc is np.sign and self.tape.single(map(operand, numbers)):
+            return float(numbers[0] > 0.0) - float(numbers[0] < 0.0)
         return NotImplemented
 
     def __neg__(self) -> Trace:
@@ -149,12 +151,11 @@ def _traceable(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-# NumPy's functions of single numbers, as they are followed where the numbers have values.
-_AT_A_POINT: dict[np.ufunc, Callable[..., Any]] = {
+# NumPy's functions of single numbers.
+_FUNCTIONS: dict[np.ufunc, Callable[..., Any]] = {
     **{ufunc: _traceable(getattr(math, name)) for name, ufunc in UFUNCS.items()},
     np.absolute: abs,
     np.square: lambda a: a * a,
-    np.sign: lambda a: float(a > 0.0) - float(a < 0.0),
-    np.minimum: min,
-    np.maximum: max,
+    np.minimum: _traceable(min),
+    np.maximum: _traceable(max),
 }

@@ -101,13 +101,14 @@ def _with_term(model: ProcessModel, term: AddedTerm) -> ProcessModel:
 
 def _added(derivative: Function, n: int, place: int, function: Callable[..., Any]) -> Function:
     """A derivative of one parameter more, p[n], times a function of (x, u) in one equation."""
+    behind = place + 1  # a slice's end that is worked out in the function does not compile
 
     def rates(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
         values = derivative(x, u, p[:n])
         return (
             *values[:place],
             values[place] + p[n] * function(x, u),
-            *values[place + 1 :],
+            *values[behind:],
         )
 
     return rates

@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -286,6 +287,30 @@ def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
     replayed = rig(*line.removeprefix("Next: rig ").split(), "--json", cwd=work)
     assert replayed.returncode == 0, replayed.stderr
     assert json.loads(replayed.stdout)["outputs"]["y"]["fit_percent"] > 99.0
+
+
+@pytest.mark.soak
+def test_a_log_whose_columns_are_called_as_the_model_calls_them_needs_no_mapping(tmp_path):
+    foreign_log(tmp_path / "bench.csv")
+    _, *rows = (tmp_path / "bench.csv").read_text().splitlines()
+    numbers = np.array([row.split(",") for row in rows], dtype=float) * [1e-3, -1.0, 1e-3]
+    named = [f"{y!r},{t!r},{u!r},0.003" for t, u, y in numbers.tolist()]
+    (tmp_path / "mine.csv").write_text("\n".join(["y,t,u,bias", *named]) + "\n")
+    (tmp_path / "lag.py").write_text(OWN_MODEL)
+    command = ["identify", "mine.csv", "--model", "lag.py:model", "--set", "population=30"]
+    more = "--generations", 8, "--out", "found"
+    result = rig(*command, *more, cwd=tmp_path, report=True)
+    assert result.returncode == 0, result.stderr
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
+    assert (tmp_path / "found" / "figures" / "signals.svg").exists()
+    (line,) = [s for s in result.stdout.splitlines() if s.startswith("Next: rig ")]
+    replayed = rig(*shlex.split(line.removeprefix("Next: rig ")), "--json", cwd=tmp_path)
+    assert json.loads(replayed.stdout)["outputs"]["y"]["fit_percent"] > 99.0
+    (tmp_path / "mine.csv").write_text("\n".join(["x,t,u,b", *named]) + "\n")
+    lacking = rig(*command, cwd=tmp_path)
+    assert lacking.returncode == 2
+    assert "mine.csv:1: model lag needs bias, y, of which there is no column" in lacking.stderr
 
 
 @pytest.mark.soak

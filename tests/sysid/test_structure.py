@@ -54,6 +54,12 @@ CASES = {
     "square": (lambda x, u, p: (x[1] ** 2, -x[1]), ((1, 1),), (0,), True),
     "remainder": (lambda x, u, p: (x[0] % 1.5 + x[1] // 2.0, -x[1]), ((1, 1),), (0,), True),
     "math": (lambda x, u, p: (math.tanh(x[0]), math.exp(p[0]) * x[0]), ((1, 0),), (0,), True),
+    "NumPy": (
+        lambda x, u, p: (np.tanh(np.abs(x[0])) + np.minimum(u[0], 0.5), np.exp(p[0]) * x[0]),
+        ((1, 0),),
+        (0,),
+        True,
+    ),
     "a branch": (lambda x, u, p: (x[1] if x[0] > 0 else -x[1], x[0]), (), (0, 1), True),
     "division by state": (lambda x, u, p: (1.0 / x[0], x[0] - x[1]), ((1, 0), (1, 1)), (0,), True),
     "input squared": (lambda x, u, p: (u[0] * u[0] - x[0], x[0]), ((0, 0), (1, 0)), (), False),

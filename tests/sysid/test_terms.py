@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks._stress_cases import MODEL, TRUTH, cases
-from sysid import Constraint, Dataset, ModelError
+from sysid import Constraint, Dataset, Input, ModelError, Output, Parameter, ProcessModel, State
+from sysid.engine.simulation import BatchSimulator
 from sysid.gassi import GASSI
 from sysid.judging.alternatives import best_alternative
 from sysid.judging.examination import suspected
@@ -39,6 +40,40 @@ def test_a_term_is_added_to_its_equation_alone(shape):
         assert rates[0] == plain[0]
         added = 7.0 * SHAPES[shape]((x[0] - 0.5) / 4.0)
         assert rates[1] - plain[1] == pytest.approx(added, abs=1e-9 * abs(plain[1]))
+
+
+def test_a_term_is_added_to_equations_that_nothing_can_follow():
+    """NumPy's sign is compiled as it is, with what is added to the last equation behind it."""
+
+    def derivative(x, u, p):
+        return x[1], u[0] - p[0] * x[1] - p[1] * np.sign(x[0])
+
+    def written_out(x, u, p):
+        rates = derivative(x, u, p)
+        return rates[0], rates[1] + p[2] * min(max(x[1] / 0.5, -1.0), 1.0)
+
+    model = replace(sprung(), derivative=derivative)
+    term = AddedTerm("v", "v", "sign", 0.5, -2.0, 0.0)
+    extended = with_terms(model, [term])
+    record = Dataset(np.sin(np.arange(60) / 5.0), np.ones(60), 0.05)
+    values = np.array([[0.3, 0.4, -0.8]])
+    expected = BatchSimulator(replace(extended, derivative=written_out)).trajectories(
+        values, record
+    )
+    found = BatchSimulator(extended).trajectories(values, record)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert np.ptp(found) > 0.1
+
+
+def sprung():
+    return ProcessModel(
+        name="sprung",
+        states=(State("q", "m", 0.2), State("v", "m/s")),
+        inputs=(Input("u", "N"),),
+        outputs=(Output("q", "m"),),
+        parameters=(Parameter("d", "1/s", 0.3, 0.0, 1.0), Parameter("c", "N", 1.5, 0.1, 5.0)),
+        derivative=lambda x, u, p: (x[1], u[0] - p[0] * x[1] - p[1] * x[0]),
+    )
 
 
 def test_outputs_constraints_and_variants_stay_those_of_the_models_own_parameters():
