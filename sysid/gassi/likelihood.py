@@ -142,8 +142,7 @@ def promising(
 
 def _slid(optimum: Optimum) -> Optimum:
     objective = optimum.objective
-    error = float(objective.error_of(optimum.rms[None])[0])
-    end = slid(objective, optimum.chromosome, error)
+    end = slid(objective, optimum.chromosome)
     return optimum if end is None else _optimum(objective, end.chromosome, end.rms)
 
 

@@ -18,7 +18,7 @@ _ITERATIONS = 15  # back onto a curved tie
 _WORSE, _NO_BETTER = 1e-5, 1e-6  # shares of the error
 
 
-def slid(objective: Objective, chromosome: FloatArray, error: float) -> Refinement | None:
+def slid(objective: Objective, chromosome: FloatArray) -> Refinement | None:
     """The minimum (n_free,) of an error, slid inside; None where no end is left by that."""
     space = objective.space
     on_end = space.on_bound(chromosome)
@@ -35,10 +35,11 @@ def slid(objective: Objective, chromosome: FloatArray, error: float) -> Refineme
         end = refine(
             objective, space.decode(start), max_iterations=_ITERATIONS, tolerance=_NO_BETTER
         )
-        if (
-            end.error <= (1.0 + _WORSE) * error
-            and not (space.on_bound(end.chromosome) & on_end).any()
-        ):
+        if (space.on_bound(end.chromosome) & on_end).any():
+            continue
+        # Both anew: descents end at integration steps of their own.
+        before, after = objective.evaluate(np.stack([chromosome, end.chromosome]))[0]
+        if after <= (1.0 + _WORSE) * before:
             return end
     return None
 

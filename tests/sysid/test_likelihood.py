@@ -318,7 +318,7 @@ def test_a_tied_value_stays_on_an_end_that_the_data_want_it_beyond():
     target = Objective(BatchSimulator(PRODUCT_LAG), space, [record])
     end = refine(target, np.array([0.5, 0.5, 0.05]))
     assert end.chromosome[:2] == pytest.approx([1.0, 1.0])
-    assert slid(target, end.chromosome, end.error) is None
+    assert slid(target, end.chromosome) is None
 
 
 @pytest.mark.soak
