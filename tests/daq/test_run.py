@@ -394,7 +394,9 @@ def test_a_signal_while_the_load_is_wound_is_recorded_with_its_phase(tmp_path):
     folder = until(lambda: next(iter((tmp_path / "runs").glob("*/log.csv")), None), "a log").parent
     process.send_signal(signal.SIGINT)
     out, errors = process.communicate(timeout=30)
-    assert process.returncode == 1 and out == "", errors
+    assert process.returncode == 1, errors
+    (mistake,) = json.loads(out)["errors"]
+    assert mistake["error"] == "stopped by Ctrl-C"
     record = record_of(folder)
     assert record["status"] == "stopped" and record["phase"] in {"open", "calibration", "homing"}
     with pytest.raises(ConfigError, match="holds 0 samples"):
