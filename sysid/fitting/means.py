@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.integrate import cumulative_simpson
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.simulation import BatchSimulator
@@ -116,6 +115,9 @@ def as_parabolas(
     """
     if not record.windows.size:
         return record
+    # It loads scipy.optimize, which takes a tenth of a second.
+    from scipy.integrate import cumulative_simpson
+
     model, inputs = simulator.model, _finely(simulator.model, record.inputs)
     blank = Dataset(inputs, np.full((len(inputs), len(model.outputs)), np.nan), record.dt / _FINE)
     run = simulator.trajectories(parameters, blank, starts=start[None])[0]

@@ -65,6 +65,7 @@ def test_slopes_of_the_responses_are_those_of_differences():
             assert np.abs(slope - exact).max() < 1e-4 * max(1.0, np.abs(exact).max())
 
 
+@pytest.mark.soak
 def test_margins_of_actuators_that_it_has_not_seen_are_larger_than_lqgs(tuned):
     unseen = draws(6)[2:]
     before, after = (largest_sensitivity(control, unseen) for control in (START, tuned))
@@ -72,6 +73,7 @@ def test_margins_of_actuators_that_it_has_not_seen_are_larger_than_lqgs(tuned):
     assert after < 0.9 * before
 
 
+@pytest.mark.soak
 def test_errors_are_those_that_are_allowed_and_friction_is_not_taken_off_twice(tuned):
     family = [MODEL.nominal, *extremes(MODEL, draws(2))]
     loops = LoopFamily(START, MODEL, MODEL.nominal, family)
@@ -82,6 +84,7 @@ def test_errors_are_those_that_are_allowed_and_friction_is_not_taken_off_twice(t
     assert gains[laws.YIELD_SHARE] <= 1.0
 
 
+@pytest.mark.soak
 def test_a_file_s_gains_are_those_of_the_program(tuned):
     again = Hinf.model_validate(tuned.model_dump(mode="json"))
     constants = again.program(MODEL, MODEL.nominal).constants

@@ -137,6 +137,7 @@ def test_the_runs_that_tell_pairs_apart_are_at_the_limits_and_beside_zero():
         assert 1.5 < reach <= 1.8
 
 
+@pytest.mark.soak
 def test_the_worst_pair_is_as_far_apart_as_a_search_of_all_runs_finds():
     models = {"square": SQUARE, "cubic": CUBIC}
     more = {**QUICK, "candidates": 24, "generations": 12, "offspring": 8}

@@ -180,6 +180,7 @@ def test_failures_are_counted():
     assert set(found.flagged_) <= {"unbounded", "over_budget"}
 
 
+@pytest.mark.soak
 def test_what_is_far_stiffer_than_most_is_found_though_the_search_passes_over_it():
     """It takes 362 steps a sample, the middle of the ranges 4: beyond 64 none is simulated."""
     model = lag(

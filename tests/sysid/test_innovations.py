@@ -342,6 +342,7 @@ def test_a_noisy_input_chooses_the_criterion():
     assert GASSI(lag(), population=20, generations=2).fit(timed).criterion_ == "innovations"
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(("noise", "coarseness"), [(0.1, 3), (5e-7, 1)])
 def test_a_filter_takes_fewer_steps_where_noise_covers_what_they_miss(noise, coarseness):
     rng, model, p, n = np.random.default_rng(2), pendulum(), np.array([2.0, 9.0, 0.4]), 300

@@ -96,6 +96,7 @@ def test_beyond_a_narrow_limit_of_a_hidden_state_the_position_is_right():
     assert rms < 2e-3 * np.abs(record.outputs).max()
 
 
+@pytest.mark.soak
 def test_refinement_sees_past_the_steps_that_switching_makes():
     record = pushed()
     model = sledge(branching)

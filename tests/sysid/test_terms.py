@@ -42,6 +42,7 @@ def test_a_term_is_added_to_its_equation_alone(shape):
         assert rates[1] - plain[1] == pytest.approx(added, abs=1e-9 * abs(plain[1]))
 
 
+@pytest.mark.soak
 def test_a_term_is_added_to_equations_that_nothing_can_follow():
     """NumPy's sign is compiled as it is, with what is added to the last equation behind it."""
 
