@@ -346,8 +346,8 @@ def _searched(
     def report(step: SearchProgress) -> None:
         activity, unit = _STAGES[step.stage]
         # Of weighing nobody knows how long it takes, nor does the search's error tell.
-        known = f"/{step.total}, best error {step.error:.3g}" if step.stage != "weigh" else ""
-        status = f"{unit} {step.done}{known}"
+        progress = f"/{step.total}, best error {step.error:.3g}" if step.stage != "weigh" else ""
+        status = f"{unit} {step.done}{progress}"
         watch(Progress(activity, step.done, step.total, status))
 
     checkpoint = folder / request.CHECKPOINT if folder is not None else None
