@@ -21,8 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-import numpy as np
-
 from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.filter_kernel import FilterKernel
 from sysid.engine.sample_kernel import SampleKernel
@@ -164,7 +162,6 @@ def _compiled(
 
     name = "".join(c if c.isalnum() else "_" for c in model.name)[:40]
     scope = {
-        "np": np,
         "math": vector_math,
         **{name: getattr(vector_math, name) for name in vector_math.OF_SLOPES},
         "wide_vectors": intrinsics.wide_vectors,

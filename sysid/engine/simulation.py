@@ -112,15 +112,14 @@ class BatchSimulator:
 
     def finer(self, accuracy: float) -> BatchSimulator:
         """The same simulations at another accuracy, stiff ones given the steps."""
-        most = max(self.max_steps, _MOST_STEPS)
-        return BatchSimulator(self.model, accuracy=accuracy, threads=self.threads, max_steps=most)
+        return self._like(accuracy, max(self.max_steps, _MOST_STEPS))
 
     def within(self, max_steps: int) -> BatchSimulator:
         """The same simulations, with no more steps per sample than that, nor than before."""
-        most = min(self.max_steps, max_steps)
-        return BatchSimulator(
-            self.model, accuracy=self.accuracy, threads=self.threads, max_steps=most
-        )
+        return self._like(self.accuracy, min(self.max_steps, max_steps))
+
+    def _like(self, accuracy: float, most: int) -> BatchSimulator:
+        return BatchSimulator(self.model, accuracy=accuracy, threads=self.threads, max_steps=most)
 
     def errors(
         self,

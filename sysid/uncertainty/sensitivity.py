@@ -199,7 +199,8 @@ def parabola_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     for k, record in enumerate(objective.records):
         start = space.starts(chromosomes, k, record.initial_state(simulator.model))[0]
         otherwise = as_parabolas(simulator, record, vector, start)
-        change += _change_by_record(sensitivity, k, otherwise) * sensitivity.share
+        if otherwise is not record:
+            change += _change_by_record(sensitivity, k, otherwise) * sensitivity.share
     yield change
 
 
