@@ -164,8 +164,9 @@ class Case:
 
     fault: of a record, with ``only_later`` not of the first log and the validation. sensor: noise
     of unit variance, (n, 2). noise: its size in parts of NOISE; calibration: what is said of it, in
-    parts of the truth, 0 where nothing is. load_noise: of the load, a measured input [N*m].
-    motors: whether every seed has a motor of its own. words: one of which names what is wrong.
+    parts of the truth, 0 where nothing is. load_noise: of the load, a measured input [N*m];
+    told: whether that is said. motors: whether every seed has a motor of its own. words: one of
+    which names what is wrong.
     """
 
     name: str
@@ -179,6 +180,7 @@ class Case:
     noise: float = 1.0
     calibration: float = 1.0
     load_noise: float = 0.0
+    told: bool = True
     validation: Validation = "another"
     logs: int = 1
     only_later: bool = False
@@ -223,7 +225,7 @@ class Case:
         applied[:, 1] += self.load_noise * rng.standard_normal(SAMPLES)
         u, y = self.fault(applied, outputs, rng) if faulty else (applied, outputs)
         known = self.calibration * self.noise * NOISE
-        of_load = np.array([0.0, self.load_noise])
+        of_load = np.array([0.0, self.load_noise * self.told])
         return Dataset(u, y, DT, name, output_noise=known, input_noise=of_load)
 
 
@@ -425,6 +427,13 @@ MORE_DATA = (
         "load half, noise overstated", each(*LOAD, _scaled(0.5)), "times what", calibration=3.0
     ),
     _in_data("load half, its noise known", each(*LOAD, _scaled(0.5)), load_noise=5e-3),
+    _in_data(
+        "load's noise, not told",
+        lambda u, y, rng: (u, y),
+        "with noise of",
+        load_noise=0.02,
+        told=False,
+    ),
 )
 STRUCTURE = (
     _in_structure("Coulomb friction", Plant(dry(FRICTION)), "sign of omega"),

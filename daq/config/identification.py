@@ -206,11 +206,6 @@ class Column(Section):
     constant: Quantity | None = Field(None, description="value in place of a column")
     unit: str | None = Field(None, description="unit of the numbers; default the model's")
     sign: Literal[-1, 1] = Field(1, description="-1 turns the direction round")
-    noise: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = Field(
-        None,
-        description="standard deviation of its samples' white noise, in the same unit; default not "
-        "known",
-    )
 
     @model_validator(mode="before")
     @classmethod
@@ -224,8 +219,6 @@ class Column(Section):
     def _one_source(self) -> Self:
         if (self.column is None) == (self.constant is None):
             raise ValueError("give either 'column' (a name in the CSV) or 'constant' (a value)")
-        if self.noise is not None and self.column is None:
-            raise ValueError("'noise' is a column's; leave it out of a constant")
         return self
 
 
@@ -415,6 +408,12 @@ class IdentificationConfig(Signals):
         default_factory=dict,
         description="by how much channels of the logs come late",
         examples=[{"torque": "3 ms"}],
+    )
+    noise: dict[str, Annotated[Quantity, Field(gt=0.0, allow_inf_nan=False)]] = Field(
+        default_factory=dict,
+        description="standard deviations of the white noise with which inputs and outputs were "
+        "measured, in the model's units or with their own; default as calibrated, else not known",
+        examples=[{"torque": "7 mN*m"}],
     )
     detrend: dict[str, Literal["constant", "linear"]] = Field(
         default_factory=dict,

@@ -44,16 +44,12 @@ class ColumnMapping:
 class ForeignTable:
     """A model's signals from a foreign log, in its units, a row for each sample.
 
-    inputs: (n, n_inputs); outputs: (n, n_outputs), NaN where not measured. input_noise,
-    output_noise: (n_inputs,) and (n_outputs,), standard deviations, 0 where not known. time: (n,)
-    [s] as the log counts it; tick: (n,) sequence numbers. torn: whether a cut last line is left
-    out.
+    inputs: (n, n_inputs); outputs: (n, n_outputs), NaN where not measured. time: (n,) [s] as the
+    log counts it; tick: (n,) sequence numbers. torn: whether a cut last line is left out.
     """
 
     inputs: FloatArray
     outputs: FloatArray
-    input_noise: FloatArray
-    output_noise: FloatArray
     time: FloatArray
     tick: IntArray
     dt: float
@@ -160,23 +156,19 @@ def read_foreign(
         cure = "merge files whose times count from the same instant"
         raise ConfigError(f"no time is in all of {spans}", cure=cure, file=path)
 
-    def values(
-        group: str, given: dict[str, Column], signals: Sequence[Signal]
-    ) -> tuple[FloatArray, FloatArray]:
-        table, noise = np.zeros((len(log.time), len(signals))), np.zeros(len(signals))
+    def values(group: str, given: dict[str, Column], signals: Sequence[Signal]) -> FloatArray:
+        table = np.zeros((len(log.time), len(signals)))
         for j, signal in enumerate(signals):
             source, key = given[signal.name], ("columns", group, signal.name, "unit")
             factor = source.sign * unit_factor(mapping.file, key, source.unit, signal.unit)
             if source.column is not None:
                 table[:, j] = columns[source.column] * factor
-                noise[j] = (source.noise or 0.0) * abs(factor)
             elif source.constant is not None:
                 table[:, j] = source.constant * factor
-        return table[kept], noise
+        return table[kept]
 
     inputs, outputs = (values(*group) for group in _groups(model, mapping.columns))
-    signals, noises = zip(inputs, outputs, strict=True)
-    return ForeignTable(*signals, *noises, log.time[kept], log.tick[kept], log.dt, log.torn)
+    return ForeignTable(inputs, outputs, log.time[kept], log.tick[kept], log.dt, log.torn)
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,7 @@ def from_frame(
 
 def _prepared(log: LoggedRecord, model: ProcessModel, selection: Selection) -> LoggedRecord:
     """A log as ``delay``, ``detrend``, ``decimate``, ``run_in`` and ``robust`` want it."""
+    log = replace(log, dataset=selection.with_noise(log.dataset, model))
     if selection.preparation.needed:
         made, before = selection.prepared(log.dataset, log.path, model), log.dataset
         steps = (*_merging(log), *made.steps)
@@ -224,8 +225,6 @@ def _foreign(
         raise mapping.file.error(TIME_UNIT, f"{problem}, too few to identify from", cure)
     dataset = replace(
         _dataset(path, model, inputs, outputs, tick, table.dt, path.stem),
-        input_noise=table.input_noise,
-        output_noise=table.output_noise,
         begin=float(time[0]),
     )
     warning = end_of_run(path, read_record(path), table.torn)

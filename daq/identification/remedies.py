@@ -44,10 +44,11 @@ def remedies(
     doubts = [fault for fault in faults if fault.severity == "doubt"]
     of_faults = [setting for fault in doubts for setting in fault.settings]
     changes: dict[str, str] = dict(setting.split("=", 1) for setting in of_faults)
-    lags = any(fault.kind == "lag" for fault in faults)  # which delays that were found are as well
+    # A lag is what delays that were found are as well, and noise of an input may look like one.
+    late = any(fault.kind == "lag" for fault in faults) or any(f.kind == "noise" for f in findings)
     units = channels or {}
     whole = [f for f in findings if f.name in units or f.kind == "exchange"]
-    of_all_logs = [f for f in whole if not (lags and f.comes_late)]
+    of_all_logs = [f for f in whole if not (late and f.comes_late)]
     # A gain or offset that wrong samples, or unknown inputs in a gap, may feign is not fitted yet.
     spoiled = any(fault.kind in _OF_SAMPLES for fault in doubts)
     of_channels = dict(_of_channels(settings, of_all_logs, units)).items()
@@ -78,6 +79,8 @@ def _of_channels(
         if finding.kind in ("delay", "filter") and finding.counts and finding.amplitude is not None:
             late = settings.delay.get(finding.name, 0.0) + finding.amplitude
             yield f"delay.{finding.name}", shortest(float(f"{late:.3g}"))
+        if finding.kind == "noise" and finding.amplitude is not None:
+            yield f"noise.{finding.name}", shortest(float(f"{finding.amplitude:.2g}"))
         key, column = columns.get(finding.name, ("", None))
         unit = None
         if column is not None and finding.kind == "gain" and finding.amplitude is not None:

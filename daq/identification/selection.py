@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +24,15 @@ class Selection:
     """What a configuration says of its logs before they are fitted; ``KEYS`` name it.
 
     use: for all logs, or by the name of a capture folder or file, with or without its ending.
-    merge: files beside a log with columns that it lacks, ``*`` for its name. file: where all this
-    stands.
+    merge: files beside a log with columns that it lacks, ``*`` for its name. noise: of channels,
+    standard deviations in the model's units. file: where all this stands.
     """
 
     use: Stretch | dict[str, Stretch] | None = None
     run_in: RunIn | None = None
     robust: bool = False
     merge: tuple[str, ...] = ()
+    noise: Mapping[str, float] = field(default_factory=dict)
     preparation: Preparation = AS_IT_IS
     file: YamlFile | None = None
 
@@ -44,8 +45,8 @@ class Selection:
     def under(cls, settings: IdentificationConfig, file: YamlFile | None = None) -> Selection:
         """From settings, and the file that they stand in."""
         preparation = Preparation(settings.delay, settings.detrend, settings.decimate)
-        merge = tuple(settings.merge)
-        return cls(settings.use, settings.run_in, settings.robust, merge, preparation, file)
+        use, run_in, robust = settings.use, settings.run_in, settings.robust
+        return cls(use, run_in, robust, tuple(settings.merge), settings.noise, preparation, file)
 
     @property
     def document(self) -> dict[str, Any]:
@@ -54,9 +55,10 @@ class Selection:
         return {key: content[key] for key in KEYS if content.get(key)}
 
     def check_channels(self, channels: Sequence[str]) -> None:
-        """Raise ConfigError for a channel to be prepared that no model has."""
-        for key in ("delay", "detrend"):
-            for name in getattr(self.preparation, key):
+        """Raise ConfigError for a channel that is named and that no model has."""
+        named = {key: getattr(self.preparation, key) for key in ("delay", "detrend")}
+        for key, names in {"noise": self.noise, **named}.items():
+            for name in names:
                 if name not in channels:
                     cure = suggestion(name, list(channels))
                     raise self._mistaken((key, name), "the model has no such channel", cure)
@@ -70,6 +72,17 @@ class Selection:
                 cure = "write its name as seen from the log, with * for the log's name"
                 raise self._mistaken(("merge",), f"there is no {file}", cure)
         return files
+
+    def with_noise(self, record: Dataset, model: ProcessModel) -> Dataset:
+        """A record with the noise of its channels as said here."""
+        if not self.noise:
+            return record
+        parts = (model.input_names, record.input_noise), (model.output_names, record.output_noise)
+        inputs, outputs = (
+            np.array([self.noise.get(name, of) for name, of in zip(names, noises, strict=True)])
+            for names, noises in parts
+        )
+        return replace(record, input_noise=inputs, output_noise=outputs)
 
     def prepared(self, record: Dataset, path: Path, model: ProcessModel) -> Prepared:
         """A record as ``delay``, ``detrend`` and ``decimate`` have it; ConfigError."""
@@ -147,7 +160,7 @@ def _names(path: Path) -> Sequence[str]:
     return [path.name, path.stem, str(path)]
 
 
-KEYS = ("use", "merge", "delay", "detrend", "decimate", "run_in", "robust")
+KEYS = ("use", "merge", "noise", "delay", "detrend", "decimate", "run_in", "robust")
 
 EVERYTHING = Selection()
 """All rows of every log, as they were measured."""

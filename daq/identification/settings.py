@@ -179,8 +179,15 @@ def in_model_units(file: File, models: Sequence[ProcessModel]) -> tuple[File, li
     """The file with plain numbers for ``fixed: {L_m: 0.5 mH}``, and what does not convert."""
     parameters = {p.name: p.unit for model in models for p in model.parameters}
     states = {s.name: s.unit for model in models for s in model.states}
+    inputs = {given.name: given.unit for model in models for given in model.inputs}
+    outputs = {output.name: output.unit for model in models for output in model.outputs}
     content, mistakes = dict(file.content), []
-    for group, units in (("ranges", parameters), ("fixed", parameters), ("initial", states)):
+    for group, units in (
+        ("ranges", parameters),
+        ("fixed", parameters),
+        ("initial", states),
+        ("noise", {**states, **inputs, **outputs}),
+    ):
         given = content.get(group)
         if not isinstance(given, Mapping):
             continue

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.judging.comparison import Candidate, Comparison, compare
-from sysid.judging.score_tests import Finding, description
-from sysid.judging.suspects import variants_of
+from sysid.judging.score_tests import Finding, description, moves_of
+from sysid.judging.suspects import input_noise, variants_of
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent, mean_known
 from sysid.problem.model import ModelError, ProcessModel
@@ -86,6 +86,39 @@ def best_alternative(
         comparison,
         terms,
     )
+
+
+def moved_by_noise(
+    finding: Finding,
+    estimator: GASSI,
+    uncertainty: Uncertainty,
+    training: Sequence[Dataset],
+) -> Finding:
+    """A finding of an input's noise, with what a fit that takes it out moves.
+
+    A step from the minimum does not tell: what of an input is likely to be noise stands for its
+    fast changes as well, and may seem larger than its samples show. Without moves where the fit
+    fails.
+    """
+    from sysid.gassi import GASSI
+
+    place = estimator.simulator().model.input_names.index(finding.name)
+    shown = input_noise(training, place)
+    size = min(finding.amplitude or shown, shown)
+    noisy = [replace(r, input_noise=_raised(r.input_noise, place, size)) for r in training]
+    try:
+        fitted = GASSI(**{**estimator.get_params(deep=False), "criterion": "auto"}).fit(noisy)
+    except ModelError:
+        return replace(finding, amplitude=size, moves=())
+    estimates = uncertainty.determined()
+    changes = [e.at(fitted.parameters_) - e.value for e in estimates]
+    return replace(finding, amplitude=size, moves=moves_of(estimates, changes))
+
+
+def _raised(noise: FloatArray, place: int, size: float) -> FloatArray:
+    raised = noise.copy()
+    raised[place] = size
+    return raised
 
 
 def _surest(

@@ -8,7 +8,7 @@ from sysid.fitting.free_run import estimate_start
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi import GASSI, PRESETS
-from sysid.judging.alternatives import Alternative, best_alternative
+from sysid.judging.alternatives import Alternative, best_alternative, moved_by_noise
 from sysid.judging.assessment import RecordResult, Verdict, examine, judge
 from sysid.judging.exchanges import exchanged_channels
 from sysid.judging.expected_errors import expected_errors
@@ -108,6 +108,9 @@ def suspected(
         findings = missing_physics(objective, chromosome, tested)
     except ModelError:  # equations that cannot be added to, or a run that fails
         return None
+    findings = tuple(
+        moved_by_noise(f, estimator, tested, training) if f.kind == "noise" else f for f in findings
+    )
     exchange = exchanged_channels(estimator, uncertainty, training)
     if exchange is not None:
         return Suspicion((exchange,), None)  # what else is found is of the wrong channels

@@ -161,7 +161,7 @@ def missing_physics(
     foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
     tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs, local))
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
-    channels = [*channels, *in_single_records(channels, runs)]
+    channels += in_single_records([s for s in channels if s.kind != "noise"], runs)
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
     if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
         tests.admit([*function_suspects(runs), *disturbance_suspects(runs)])
@@ -660,6 +660,7 @@ _WORDS = {
     "play": "{name} acts through play (hysteresis) of {amplitude:.3g} {unit}",
     "offset": "{name} is {amplitude:.3g} {unit} off{instead}",
     "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on{instead}",
+    "noise": "{name} is logged with noise of {amplitude:.2g} {unit}, which has not acted",
     "saturation": "{name} saturates near its largest values",
     "exchange": "{name} have changed places in the log",
 }

@@ -15,6 +15,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.judging.disturbed import DisturbedRun
 from sysid.linear.polynomials import all_pole
+from sysid.problem.channels import noise
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ProcessModel, State
 from sysid.problem.preparation import at_places
@@ -30,6 +31,7 @@ Kind = Literal[
     "drift",
     "gain",
     "saturation",
+    "noise",
     "change",
     "function",
     "disturbance",
@@ -76,7 +78,7 @@ class Suspect:
     def one_sided(self) -> bool:
         """Whether only amplitudes above zero make sense: friction never drives."""
         rubs = any(term.shape == "stribeck" for term in self.terms)
-        return rubs or self.kind in ("variant", "saturation", "filter", "lag", "play")
+        return rubs or self.kind in ("variant", "saturation", "filter", "lag", "play", "noise")
 
     def same(self, suspect: "Suspect") -> bool:
         """Whether it is a delay of the same channel, of another size."""
@@ -103,6 +105,7 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             for late in _late(kind, given.name, partial(_input_changed, runs, i, change), runs):
                 yield replace(late, of_input=True)
         yield from _plays(given, partial(_input_changed, runs, i, _with_play), runs, i)
+        yield from _noises(given, runs, i)
         zeroed = any(run.record.input_zero[i] for run in runs)
         for kind, signal in _faults(partial(_input, i), zeroed):
             parts = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
@@ -157,6 +160,29 @@ def _plays(
         size = part * peak
         changes = change(size) / size
         yield Suspect("play", given.name, given.unit, changes, late=change, of_input=True)
+
+
+def _noises(given: Input, runs: Sequence[DisturbedRun], i: int) -> Iterator[Suspect]:
+    """White noise of an input of which none is known: what was logged and has not acted.
+
+    By so much of it as the input's own samples show, of which a Wiener filter tells what it was.
+    """
+    records = [run.record for run in runs]
+    size = input_noise(records, i)
+    if any(record.input_noise[i] for record in records) or not size:
+        return
+    parts = [
+        run.driven(_column(run.record.inputs, i, likely_noise(run.record.inputs[:, i], size)))
+        for run in runs
+    ]
+    changes = -np.concatenate(parts)[..., None] / size
+    yield Suspect("noise", given.name, given.unit, changes, of_input=True)
+
+
+def input_noise(records: Sequence[Dataset], i: int) -> float:
+    """Standard deviation of an input's white noise as its samples show it; 0 of a smooth one."""
+    sizes = [noise(record.inputs[:, i]) for record in records]
+    return float(np.sqrt(np.mean(np.square(sizes))))
 
 
 def _with_play(run: DisturbedRun, i: int, width: float) -> FloatArray:

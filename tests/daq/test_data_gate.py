@@ -108,14 +108,9 @@ MISTAKES = {
         "day1.csv lie in it: the log has rows 1 .. 200, 0 s .. 1.99 s; choose a part of that",
     ),
     "no such log": ({"use": {"day3": "0 s .. 1 s"}}, "use.day3: none of the logs has this name"),
-    "noise of a constant": (
-        {"columns": {**OF_LAG["columns"], "inputs": {"u": {"constant": 1.0, "noise": 0.1}}}},
-        "columns.inputs.u: 'noise' is a column's; leave it out of a constant",
-    ),
-    "noise below zero": (
-        {"columns": {**OF_LAG["columns"], "outputs": {"y": {"column": "y", "noise": -1.0}}}},
-        "columns.outputs.y.noise: ",
-    ),
+    "noise below zero": ({"noise": {"y": -1.0}}, "noise.y: "),
+    "noise of no channel": ({"noise": {"yy": 1.0}}, "noise.yy: the model has no such channel; did"),
+    "noise in another unit": ({"noise": {"y": "3 V"}}, "noise.y: 'V' does not convert to 'm'"),
     "a run-in of volts": ({"run_in": "3 V"}, "run_in: 'V' does not convert to 's'"),
     "a run-in of everything": (
         {"run_in": "9 s"},
@@ -164,24 +159,17 @@ def test_a_reciprocal_is_a_unit(folder):
     assert loaded(folder, columns=columns).dataset.inputs[0, 0] == 5000.0
 
 
-def with_noise(group, name, **entries):
-    columns = json.loads(json.dumps(OF_LAG["columns"]))
-    columns[group][name] |= entries
-    return columns
-
-
-def test_noise_of_a_column_is_told_in_its_unit(folder):
+def test_noise_of_a_channel_is_told_in_units_of_its_own(folder):
     slope = "model = replace(model, inputs=(replace(model.inputs[0], unit='V'),))\n"
     (folder / "lag.py").write_text(f"{MODEL}from dataclasses import replace\n{slope}")
-    columns = with_noise("inputs", "u", unit="mV", sign=-1, noise=3.0)
-    assert loaded(folder, columns=columns).dataset.input_noise == pytest.approx([0.003])
+    noisy = loaded(folder, noise={"u": "3 mV"}).dataset
+    assert noisy.input_noise == pytest.approx([0.003]) and noisy.output_noise == [0.0]
     assert loaded(folder).dataset.input_noise == [0.0]
 
 
 @pytest.mark.parametrize(("noise", "trust"), [(0.03, "good"), (0.01, "limited")])
 def test_noise_that_is_given_tells_whether_more_could_be_explained(folder, noise, trust):
-    columns = with_noise("outputs", "y", noise=noise)  # 0.03 in truth
-    config = configured(folder, columns=columns, population=64, generations=10)
+    config = configured(folder, noise={"y": noise}, population=64, generations=10)  # 0.03 in truth
     verdict = identify(folder / "day1.csv", folder / "day2.csv", config=config).verdict
     assert verdict.parameters.trust == trust
     predicted = " ".join(verdict.predicted.reasons)
