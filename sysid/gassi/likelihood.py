@@ -54,7 +54,8 @@ _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _SLACK = 1e-10  # of the most that is told, which is told of every coordinate
 _EXPLORED = 2  # minima whose lookalikes are descended from
-_EXPLORED_BY_FILTER = 5  # the same, of which each has to be better than the one before
+_EXPLORED_BY_FILTER = 5  # the same by a filter
+_BETTER = Z95**2  # deviance by which one of them has to be better than the one before
 # Minima are one when the way between them, were all linear, changed twice the log-likelihood by
 # less than this.
 _ONE = 16.0
@@ -293,7 +294,7 @@ def _explored(
     explored = None
     for _ in range(_EXPLORED if lookalike else 1):
         best = optima.ranked()[0]
-        if best is explored:
+        if explored is not None and optima.deviance(explored, best) < _BETTER:
             break  # nothing better was found around it
         explored = best
         starts = lookalikes(best.objective, best.chromosome) if lookalike else minima[1:]
@@ -377,7 +378,7 @@ def _refitted(
     too_well = _too_well(ranked[0].rms)
     optima, best, explored = _Optima.around(first, objective, too_well), first, None
     for _ in range(_EXPLORED_BY_FILTER if filters else 1):
-        if best is explored:
+        if explored is not None and optima.deviance(explored, best) < _BETTER:
             break
         explored = best
         starts += lookalikes(first.objective, best.chromosome) if filters else []
@@ -392,7 +393,7 @@ def _refitted(
                 near = (o for o in others if optima.deviance(o, best) < _CONCEIVABLE)
                 starts = [optimum.chromosome for optimum in near]
                 optima, best = _Optima.around(anew, objective, too_well), anew
-                first = anew
+                first, explored = anew, None
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
