@@ -53,7 +53,7 @@ _SHOWING = 0.025  # part of an output's peak that inputs' averages may take from
 # deviation from which they do.
 _DRAWS, _BENT = 8, 0.1
 # Integration steps of a free run that one of a filter may stand for, and by how many deviations of
-# any quantity the difference may move it.
+# any quantity the difference may move it where an answer is at stake.
 _COARSER, _MOVING = (3, 2), 0.2
 _FEWEST = 2  # a sample, where a free run takes more
 
@@ -130,9 +130,10 @@ class Innovations(Objective):
         )
         return variant.settled(chromosome).eased(chromosome)
 
-    def eased(self, chromosome: FloatArray) -> Self:
+    def eased(self, chromosome: FloatArray, moving: float = _MOVING) -> Self:
         """With as few integration steps as tell the same at a chromosome, (n_free,).
 
+        moving: deviations of any quantity that the difference may move it by.
         Errors of a free run's steps add up over its memory; a filter forgets them, as its outputs
         correct it, and noise covers what is left of them.
         """
@@ -141,7 +142,7 @@ class Innovations(Objective):
         exact = self._with(coarseness=1)._in_noise(chromosome)
         for coarseness in _COARSER:
             coarser = self._with(coarseness=coarseness)
-            if np.linalg.norm(coarser._in_noise(chromosome) - exact) < _MOVING:
+            if np.linalg.norm(coarser._in_noise(chromosome) - exact) < moving:
                 return coarser
         return self
 

@@ -1,10 +1,11 @@
 """Parts of long records by which a search goes, before all of them are fitted.
 
 A search takes thousands of simulations, and where minima lie a few thousand samples tell as well as
-a long record. The parts are those whose channels and their changes vary most between them: the
-determinant of the sum of their moments is made large, one part after the other (greedy
-D-optimality, as in Fedorov, "Theory of optimal experiments", 1972, with the moments in place of a
-model's information). Those of staircases are the ramps and steps, at every level.
+a long record, or as many records. The records, and the parts of each, are those whose channels and
+their changes vary most between them: the determinant of the sum of their moments is made large, one
+after the other (greedy D-optimality, as in Fedorov, "Theory of optimal experiments", 1972, with the
+moments in place of a model's information). Those of staircases are the ramps and steps, at every
+level.
 """
 
 from __future__ import annotations
@@ -36,27 +37,29 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Excerpt:
-    """Parts of records, those of each in order of time and the first from its first row."""
+    """Parts of some records, those of each in order of time and the first from its first row."""
 
     records: Sequence[Dataset]
     parts: tuple[Part, ...]
 
     @classmethod
-    def of(cls, records: Sequence[Dataset], samples: int) -> Excerpt | None:
+    def of(cls, records: Sequence[Dataset], samples: int, *, every: bool = True) -> Excerpt | None:
         """An excerpt of about that many samples; None where it would not be half of all.
 
         Of a record as many parts as its share, one at least; a record shorter than two parts whole.
+        Of every record, or of as many as it takes: a parameter may be told by one record alone.
         """
         total = sum(record.n_samples for record in records)
         if samples == 0 or total <= 2 * samples:
             return None
+        chosen = range(len(records)) if every else _telling_records(records, samples)
+        share = samples / _LENGTH / sum(records[place].n_samples for place in chosen)
         parts: list[Part] = []
-        for place, record in enumerate(records):
-            count = max(1, round(samples / _LENGTH * record.n_samples / total))
-            whole = record.n_samples < 2 * _LENGTH
-            begins = [0] if whole else _telling(record, count)
-            end = record.n_samples if whole else _LENGTH
-            parts += [Part(place, begin, begin + end) for begin in begins]
+        for place in chosen:
+            record = records[place]
+            whole = _least(record) == record.n_samples
+            begins = [0] if whole else _telling(record, max(1, round(share * record.n_samples)))
+            parts += [Part(place, begin, begin + _least(record)) for begin in begins]
         excerpt = cls(tuple(records), tuple(parts))
         return excerpt if 2 * excerpt.n_samples < total else None
 
@@ -109,21 +112,55 @@ class Excerpt:
     ) -> tuple[SearchSpace, list[FloatArray]]:
         """Space and chromosomes (n_free,) of the parts as those of the records.
 
-        A record starts where the part at its beginning does.
+        A record starts where the part at its beginning does, one without parts as declared.
         """
-        n, head = len(space.index), {part.place: k for k, part in enumerate(self.parts)}
-        head |= {part.place: k for k, part in enumerate(self.parts) if part.begin == 0}
+        n = len(space.index)
+        head = {part.place: k for k, part in enumerate(self.parts) if part.begin == 0}
         plain = space.without_starts()
-        if not space.estimated:
-            return plain, [chromosome[:n] for chromosome in chromosomes]
         whole = plain.with_starts(self.records)
+        bare = not space.estimated and plain.with_starts(self.datasets()).estimated
+        if bare or not whole.estimated:
+            return plain, [chromosome[:n] for chromosome in chromosomes]
         column = {start: n + j for j, start in enumerate(space.estimated)}
-        columns = [*range(n), *(column[head[place], state] for place, state in whole.estimated)]
+        columns = {
+            n + j: column[head[place], state]
+            for j, (place, state) in enumerate(whole.estimated)
+            if place in head
+        }
         # A range around the first sample may be narrower for the part than for all.
         ends = [(p.lower, p.upper) for p in whole.parameters]
         low, high = np.array(ends).T
         low[:n], high[:n] = -np.inf, np.inf
-        return whole, [np.clip(chromosome[columns], low, high) for chromosome in chromosomes]
+        on_all = whole.with_nominal_starts(np.stack(chromosomes)[:, :n])
+        on_all[:, list(columns)] = np.stack(chromosomes)[:, list(columns.values())]
+        return whole, list(np.clip(on_all, low, high))
+
+
+def _least(record: Dataset) -> int:
+    """Samples of the least that is taken of a record: all of a short one."""
+    return record.n_samples if record.n_samples < 2 * _LENGTH else _LENGTH
+
+
+def _telling_records(records: Sequence[Dataset], samples: int) -> list[int]:
+    """Places of the records that tell most together, sorted, of at least so many samples.
+
+    With every output that is measured at all.
+    """
+    moments = np.array([signals.T @ signals / len(signals) for signals in _signals(records)])
+    seen = np.array([np.isfinite(record.outputs).any(axis=0) for record in records])
+    sizes = np.array([_least(record) for record in records])
+    chosen = np.zeros(len(records), dtype=bool)
+    sum_of_moments = _RIDGE * np.eye(moments.shape[1])
+    while True:
+        lacking = ~seen[chosen].any(axis=0)
+        enough = sizes[chosen].sum() > samples - _LENGTH // 2
+        free = ~chosen & (seen[:, lacking].any(axis=1) if enough else True)
+        if not free.any():
+            return np.flatnonzero(chosen).tolist()
+        gains = np.linalg.slogdet(sum_of_moments + moments)[1]
+        best = int(np.argmax(np.where(free, gains, -np.inf)))
+        chosen[best] = True
+        sum_of_moments = sum_of_moments + moments[best]
 
 
 def _telling(record: Dataset, count: int) -> list[int]:
@@ -143,18 +180,23 @@ def _telling(record: Dataset, count: int) -> list[int]:
 
 
 def _moments(record: Dataset) -> FloatArray:
-    """Sums of products of channels, their changes and one, (n_parts, n, n), half a part apart."""
-    channels = np.concatenate([record.inputs, record.outputs], axis=1)
-    seen = np.isfinite(channels)
-    mean = np.where(seen, channels, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-    channels = np.where(seen, channels - mean, 0.0)
-    changes = np.diff(channels, axis=0, prepend=channels[:1])
-    signals = np.concatenate([channels, changes], axis=1)
-    size = signals.std(axis=0)
-    signals /= np.where(size > 0.0, size, 1.0)
-    signals = np.concatenate([signals, np.ones((len(signals), 1))], axis=1)
+    """Sums of products of the signals, (n_parts, n, n), half a part apart."""
+    (signals,) = _signals([record])
     halves = len(signals) // (_LENGTH // 2)
     pieces = signals[: halves * (_LENGTH // 2)].reshape(halves, _LENGTH // 2, -1)
     half_moments = np.einsum("kti,ktj->kij", pieces, pieces)
     moments: FloatArray = half_moments[:-1] + half_moments[1:]
     return moments
+
+
+def _signals(records: Sequence[Dataset]) -> list[FloatArray]:
+    """Channels, their changes and one, (n_samples, n), in parts of how all records vary."""
+    channels = [np.concatenate([record.inputs, record.outputs], axis=1) for record in records]
+    seen = np.isfinite(np.concatenate(channels))
+    total = np.where(seen, np.concatenate(channels), 0.0).sum(axis=0)
+    mean = total / np.maximum(seen.sum(axis=0), 1)
+    centred = [np.where(np.isfinite(part), part - mean, 0.0) for part in channels]
+    signals = [np.hstack([part, np.diff(part, axis=0, prepend=part[:1])]) for part in centred]
+    size = np.concatenate(signals).std(axis=0)
+    size[size == 0.0] = 1.0
+    return [np.hstack([part / size, np.ones((len(part), 1))]) for part in signals]

@@ -46,7 +46,7 @@ def by_filter(objective: Objective, fitted: Innovations, little: BoolArray) -> l
     """
     noise = np.where(little, _LITTLE, 1.0) * fitted.noise
     filtered = fitted.of_noise(noise).weighed(objective.weights)
-    excerpt = Excerpt.of(fitted.records, SAMPLES)
+    excerpt = Excerpt.of(fitted.records, SAMPLES, every=False)
     if excerpt is None:
         return _minima(filtered)
     part = excerpt.of_all(filtered)

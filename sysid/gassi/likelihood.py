@@ -50,6 +50,7 @@ _TOLD_APART = 13.3
 _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
 _MOST_PROMISING = 3  # minima of a part of the data that are fitted to all
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
+_MOVING = 2.0  # deviations that errors of the integration may make on an excerpt
 _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
 _SLACK = 1e-10  # of the most that is told, which is told of every coordinate
@@ -407,10 +408,11 @@ def _conceivable(
     None is left out for another of them, which may be at its end sooner.
     """
     # A filter forgets where an excerpt starts, as free runs do not.
-    filters = isinstance(objective, Innovations) and objective.corrects
-    excerpt = Excerpt.of(objective.records, SAMPLES) if filters else None
-    if excerpt is not None and starts:
-        starts = _conceivable_by(excerpt, objective, starts, optima, best)
+    if isinstance(objective, Innovations) and objective.corrects and starts:
+        excerpt = Excerpt.of(objective.records, SAMPLES, every=False)
+        if excerpt is not None:
+            easier = objective.eased(best.chromosome, _MOVING)
+            starts = _conceivable_by(excerpt, easier, starts, optima, best)
     return [
         end
         for end in _quickly(objective, starts, optima.new)

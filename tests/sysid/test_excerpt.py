@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -88,6 +89,26 @@ def test_a_record_starts_where_the_part_at_its_beginning_does():
     assert parts.tolist() == [2.0, 0.05, 1.0, *[of_parts.parameters[-2].nominal] * 3, 5.0]
     bare, (alone,) = excerpt.on_all(plain, [np.array([2.0, 0.05])])
     assert bare == plain and alone.tolist() == [2.0, 0.05]
+
+
+def test_of_many_short_records_those_that_differ_most_are_enough():
+    steps = staircase()
+    level = steps.part(100, 1100, "level")
+    records = [level, level, steps.part(1500, 2500, "step"), level, steps.part(3600, 4600, "far")]
+    blank = replace(level, outputs=np.full_like(level.outputs, np.nan))
+    excerpt = Excerpt.of([blank, *records, blank], 2048, every=False)
+    assert Excerpt.of([blank, *records, blank], 2048) is None
+    assert excerpt.places == [3, 5] and excerpt.n_samples == 2000
+    lost = np.full(1000, np.nan)
+    unseen = [Dataset(r.inputs, np.c_[r.outputs, lost], 0.01) for r in records]
+    seen = Dataset(level.inputs, np.c_[lost, lost], 0.01)
+    seen.outputs[500, 1] = 1.0  # what no other measures
+    assert 10 in Excerpt.of([*unseen, *unseen, seen], 2048, every=False).places
+    plain = SearchSpace.of(hidden_lag())
+    of_parts = plain.with_starts(excerpt.datasets())
+    whole, (chromosome,) = excerpt.on_all(of_parts, [np.array([2.0, 0.05, 1.0, 3.0])])
+    declared = whole.parameters[-1].nominal
+    assert chromosome.tolist() == [2.0, 0.05, *[declared] * 3, 1.0, declared, 3.0, declared]
 
 
 @pytest.fixture(scope="module")
