@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     Source = str | Path | Recording | pd.DataFrame
 
-Loaded = Callable[[ProcessModel, Split], None]
+Loaded = Callable[[Problem, Split], None]
 
 _COPY = 0.99  # of a log's samples that stand in another as well
 
@@ -133,7 +133,8 @@ def fit(
 
     folder: for ``parameters.yaml``, and while the search runs for what it takes to continue it.
     resume: continue from there. examine: whether what the model may lack is to be tested, which
-    may take longer than the fit. loaded: is given the model and the logs, once these may be fitted.
+    may take longer than the fit. loaded: is given the problem and the logs, before these are looked
+    at.
     Raises ConfigError.
     """
     train, check = load_logs(problem, training, validation)
@@ -144,11 +145,11 @@ def fit(
     train, ends = records.hold_back(train, problem.settings.hold_back)
     _require_information(problem, train)
     logs = train, [*ends, *check]
+    if loaded is not None:
+        loaded(problem, logs)
     faults = faults_of(problem, logs)
     for fault in faults:
         watch(Note("warning" if fault.severity == "doubt" else "note", fault.sentence))
-    if loaded is not None:
-        loaded(problem.model, logs)
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     try:

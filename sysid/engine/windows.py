@@ -56,6 +56,22 @@ def _with_integrals(model: ProcessModel, places: tuple[int, ...]) -> ProcessMode
     )
 
 
+def _parabola(s: Any) -> tuple[Any, Any, Any]:
+    """Weights in the parabola's value of both samples and of the area between them."""
+    return 1.0 - 4.0 * s + 3.0 * s * s, -2.0 * s + 3.0 * s * s, 6.0 * s - 6.0 * s * s
+
+
+def _area(s: Any) -> tuple[Any, Any, Any]:
+    """The same in the area under it up to a part of the way."""
+    s2, s3 = s * s, s * s * s
+    return s - 2.0 * s2 + s3, -s2 + s3, 3.0 * s2 - 2.0 * s3
+
+
+# Of one number in kernels; of arrays plain, for which a compiler would take a second.
+_parabola_at: Any = njit(_parabola)
+_area_at: Any = njit(_area)
+
+
 @njit(cache=True, nogil=True)
 def average(outputs: FloatArray, integrals: FloatArray, windows: FloatArray) -> FloatArray:
     """An output with each sample its mean over a window, (n_samples, n_lanes).
@@ -72,13 +88,13 @@ def average(outputs: FloatArray, integrals: FloatArray, windows: FloatArray) -> 
         i, j = min(math.floor(begin), n - 2), min(math.floor(end), n - 2)
         a, b = begin - i, end - j
         if end - begin < _INSTANT:
-            v0, v1, area = _parabola(b)
+            v0, v1, area = _parabola_at(b)
             for lane in range(lanes):
                 change = integrals[j + 1, lane] - integrals[j, lane]
                 means[k, lane] = v0 * outputs[j, lane] + v1 * outputs[j + 1, lane] + area * change
             continue
-        a0, a1, area_a = _area(a)
-        b0, b1, area_b = _area(b)
+        a0, a1, area_a = _area_at(a)
+        b0, b1, area_b = _area_at(b)
         part = 1.0 / (end - begin)
         for lane in range(lanes):
             change = integrals[i + 1, lane] - integrals[i, lane]
@@ -129,19 +145,6 @@ def weights_of_sums(windows: FloatArray, seen: BoolArray) -> FloatArray | None:
         weights[i, 1, :3] = [0.0, 0.0, 1.0] - part
         weights[i + 1 : k, 1, 2:] = 1.0
     return weights
-
-
-@njit(cache=True, nogil=True)
-def _parabola(s: float) -> tuple[float, float, float]:
-    """Weights in the parabola's value of both samples and of the area between them."""
-    return 1.0 - 4.0 * s + 3.0 * s * s, -2.0 * s + 3.0 * s * s, 6.0 * s - 6.0 * s * s
-
-
-@njit(cache=True, nogil=True)
-def _area(s: float) -> tuple[float, float, float]:
-    """The same in the area under it up to a part of the way."""
-    s2, s3 = s * s, s * s * s
-    return s - 2.0 * s2 + s3, -s2 + s3, 3.0 * s2 - 2.0 * s3
 
 
 @njit(cache=True, nogil=True)

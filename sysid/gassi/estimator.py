@@ -471,7 +471,7 @@ class GASSI(RecordEstimator):
             where = ", ".join(record.name for record in records[:3])
             raise ModelError(
                 f"criterion {self.criterion} needs the noise of a measured input, and {where} "
-                "tells none; give it ('noise' of a column, input_noise of a Dataset), or choose "
+                "tells none; give it (noise: {NAME: ...}, input_noise of a Dataset), or choose "
                 "criterion likelihood"
             )
         return self._of_noisy_inputs(records, noisy)
