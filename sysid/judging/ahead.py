@@ -24,13 +24,13 @@ def compile_ahead(model: ProcessModel, record: Dataset) -> None:
     >>> compile_ahead(lag(), lag_record())
     """
     simulator = BatchSimulator(model, threads=1)
-    vector, one = model.nominal, np.ones((1, 1), dtype=np.int64)
+    vector, n_steps = model.nominal, np.ones((1, 1), dtype=np.int64)
     head = record.part(0, min(_SAMPLES, record.n_samples), record.name)
     start = head.initial_state(model)
     with suppress(ModelError):  # whatever fails is said where its result is wanted
         if noisy_inputs([head]):
             bent, noise = with_reactions(model, head, vector, start), np.ones(len(model.outputs))
-            simulator.innovations(vector[None], [bent], [noise], one, [None], noise)
+            simulator.innovations(vector[None], [bent], [noise], n_steps, [None], noise)
     with suppress(ModelError):
         DisturbedRun(model, vector, head, start)
     with suppress(ModelError):

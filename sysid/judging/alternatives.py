@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent, mean_known
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.terms import AddedTerm, with_terms
-from sysid.uncertainty import Uncertainty
+from sysid.uncertainty import Estimate, Uncertainty
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
@@ -110,7 +110,7 @@ def moved_by_noise(
         fitted = GASSI(**{**estimator.get_params(deep=False), "criterion": "auto"}).fit(noisy)
     except ModelError:
         return replace(finding, amplitude=size, moves=())
-    estimates = uncertainty.determined()
+    estimates = list(_shared(uncertainty, fitted.parameters_))
     changes = [e.at(fitted.parameters_) - e.value for e in estimates]
     return replace(finding, amplitude=size, moves=moves_of(estimates, changes))
 
@@ -151,12 +151,18 @@ def _moved(
 ) -> dict[str, tuple[float, float, str]]:
     """Determined quantities that the variant has outside of their intervals, the farthest first."""
     moved = []
-    for estimate in uncertainty.determined():
-        combination = estimate.combination
-        names = (estimate.name,) if combination is None else combination.names
-        shared = all(name in parameters for name in names)
-        if shared and estimate.deviation and estimate.excludes(parameters):
+    for estimate in _shared(uncertainty, parameters):
+        if estimate.deviation and estimate.excludes(parameters):
             value = estimate.at(parameters)
             far = abs(value - estimate.value) / estimate.deviation
             moved.append((far, estimate.name, (estimate.value, value, estimate.unit)))
     return {name: values for _, name, values in sorted(moved, key=lambda m: -m[0])}
+
+
+def _shared(uncertainty: Uncertainty, parameters: dict[str, float]) -> Iterator[Estimate]:
+    """Determined quantities of parameters that another fit has as well."""
+    for estimate in uncertainty.determined():
+        combination = estimate.combination
+        names = (estimate.name,) if combination is None else combination.names
+        if all(name in parameters for name in names):
+            yield estimate

@@ -45,7 +45,7 @@ CASES = {case.name: case for case in cases()}
             ("drag", "a term in omega (square) in domega/dt"),
             ("speed clipped at 80 %", "omega saturates near its largest values"),
             ("Coulomb friction, load's noise", "a term in the sign of omega"),
-            ("load's noise, not told", "load is logged with noise of 0.02"),
+            ("load's noise, not told", "load is logged with noise of 0.018"),
             ("load off in later logs", "load of training 2 is 0.0"),
         ],
     ),
