@@ -207,6 +207,17 @@ class Innovations(Objective):
             vars(part).update(colour=colours, scatter=[scatter(record) for record in records])
         return part
 
+    def of_record(self, place: int, record: Dataset) -> Objective:
+        """As of ``Objective``, with the scatter of the record in whose place it is."""
+        part = super().of_record(place, record)
+        vars(part).update(scatter=[self.scatter[place]])
+        return part
+
+    @property
+    def coupled(self) -> bool:
+        """As of ``Objective``: noise of the process balances all records together."""
+        return bool(self.process.any())
+
     @property
     def _least_scatter(self) -> FloatArray:
         """Deviation that nine samples of ten have, (n_outputs,): the tenth must not tell all."""

@@ -130,6 +130,15 @@ class Objective:
         return self._with(records=list(records), counts=counts, scales=scales)
 
     @property
+    def coupled(self) -> bool:
+        """Whether residuals of a record depend on the others."""
+        return False
+
+    def of_record(self, place: int, record: Dataset) -> Objective:
+        """The same objective of a record alone, in the place of another, over the same space."""
+        return self.on([record], [place]).over(self.space.of_record(place))
+
+    @property
     def free_run(self) -> Objective:
         """The objective of the free run's errors: this one."""
         return self

@@ -147,6 +147,11 @@ class SearchSpace:
         """The same space of the parameters alone."""
         return replace(self, parameters=self.parameters[: len(self.index)], estimated=())
 
+    def of_record(self, place: int) -> SearchSpace:
+        """The same space for that record alone; starts of the others move nothing."""
+        estimated = tuple((record - place, state) for record, state in self.estimated)
+        return replace(self, estimated=estimated)
+
     def with_nominal_starts(self, chromosomes: FloatArray) -> FloatArray:
         """Chromosomes of the parameters alone, completed by where the states start otherwise."""
         begin = [parameter.nominal for parameter in self.parameters[len(self.index) :]]

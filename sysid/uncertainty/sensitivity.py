@@ -310,9 +310,16 @@ def _driven_changes(
 
 def _change_by_record(sensitivity: Sensitivity, k: int, record: Dataset) -> FloatArray:
     """Change of all residuals with another record k."""
-    objective = sensitivity.objective
-    records = list(objective.records)
-    records[k] = record
-    moved = objective.on(records).residuals(sensitivity.chromosome[None], sensitivity.steps)
-    change = moved.values[..., 0] - sensitivity.residual
-    return np.where(np.isfinite(change), change, 0.0)
+    objective, chromosome = sensitivity.objective, sensitivity.chromosome[None]
+    rows, steps = slice(None), sensitivity.steps
+    if objective.coupled:
+        records = list(objective.records)
+        records[k] = record
+        disturbed = objective.on(records)
+    else:
+        rows, steps = record_rows(sensitivity.lengths)[k], steps[k : k + 1]
+        disturbed = objective.of_record(k, record)
+    moved = disturbed.residuals(chromosome, steps).values[..., 0] - sensitivity.residual[rows]
+    change = np.zeros_like(sensitivity.residual)
+    change[rows] = np.where(np.isfinite(moved), moved, 0.0)
+    return change
