@@ -280,16 +280,8 @@ class _Tests:
         late = {(suspects[i].kind, suspects[i].name) for i in left if suspects[i].late is not None}
         tests = len(late) + sum(suspects[i].late is None for i in left)
         while left and len(self.findings) < _MOST:
-            first = {
-                i: result
-                for i in left
-                if (result := self._regression.test(changes[i], suspects[i].one_sided)) is not None
-            }
-            likely: list[int] = []
-            for i in sorted(first, key=lambda i: first[i].log_p):
-                if len(likely) < _LIKELY and not any(suspects[i].same(suspects[k]) for k in likely):
-                    likely.append(i)
-            results = {i: self._again(changes[i], suspects[i], first[i]) for i in likely}
+            first = self._likeliest(changes, suspects, left)
+            results = {i: self._again(changes[i], suspects[i], test) for i, test in first.items()}
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
             significant = [i for i in logs if logs[i] < np.log(_CHANCE)]
             if not significant:
@@ -317,6 +309,28 @@ class _Tests:
             self._ends.append(len(self._free))
             self._regression = self._coloured_by(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
+
+    def _likeliest(
+        self, changes: Sequence[FloatArray], suspects: Sequence[Suspect], left: Sequence[int]
+    ) -> dict[int, "_Result"]:
+        """Tests of the suspects whose probabilities are the smallest, of different ones.
+
+        In order of what the probabilities are at least, until the rest cannot be among them.
+        """
+        least = {i: self._regression.least(changes[i], suspects[i].one_sided) for i in left}
+        tests: dict[int, _Result] = {}
+        likely: list[int] = []
+        for i in sorted(left, key=lambda i: least[i]):
+            if len(likely) == _LIKELY and least[i] > tests[likely[-1]].log_p:
+                break
+            result = self._regression.test(changes[i], suspects[i].one_sided)
+            if result is None:
+                continue
+            tests[i], likely = result, []
+            for k in sorted(tests, key=lambda k: (tests[k].log_p, k)):
+                if len(likely) < _LIKELY and not any(suspects[k].same(suspects[j]) for j in likely):
+                    likely.append(k)
+        return {i: tests[i] for i in likely}
 
     def _again(
         self, changes: FloatArray, suspect: Suspect, first: "_Result"
@@ -431,15 +445,37 @@ class _Regression:
         self.whitening = whitening
         white, target = whitening(columns), whitening(residual[..., None])
         self._n = len(target)
-        self._basis, self._triangle = np.linalg.qr(np.vstack([white, np.diag(free)]))
-        within, beyond = self._split(target)
-        self._coefficients, self._residual = self._solved(within[:, 0]), beyond[:, 0]
-        self._noises = [
-            (whitening.rows_of(rows), whitening.of_record(rows, changes))
-            for rows, changes in noises
-        ]
-        self._noises_within = [self._basis[rows].T @ noise for rows, noise in self._noises]
+        rows_of_records = [whitening.rows_of(rows) for rows in record_rows(whitening.lengths)]
+        self._basis = _Basis(white, free, rows_of_records)
+        within, beyond = self._basis.split(target)
+        self._coefficients, self._residual = self._basis.solved(within[:, 0]), beyond[:, 0]
+        self._noises = noises
         self.squares = float(self._residual[: self._n] @ self._residual[: self._n])
+
+    def least(self, changes: FloatArray, one_sided: bool) -> float:
+        """What the logarithm of a suspect's probability is at least, by its test.
+
+        That of white residuals, which needs no row of what the regression's columns leave.
+        """
+        columns, size = self._scaled(changes)
+        if not columns.size:
+            return math.inf
+        if one_sided and len(size) > 1:
+            return -math.inf
+        rows = _span(columns)
+        within = self._basis.within(columns[rows], rows)
+        squares, axes = np.linalg.eigh(columns[rows].T @ columns[rows] - within.T @ within)
+        new = squares > _NEW**2
+        score = (axes[:, new].T @ (columns[rows].T @ self._residual[rows])) / np.sqrt(squares[new])
+        if not new.any() or (one_sided and axes[0, 0] * score[0] <= 0.0):
+            return math.inf
+        return _log(float(chdtrc(int(new.sum()), score @ score)))
+
+    def _scaled(self, changes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Whitened columns of unit length, those without any left out, and all their lengths."""
+        white = self.whitening(changes)
+        size = np.linalg.norm(white, axis=0)
+        return white[:, size > 0.0] / size[size > 0.0], size
 
     def test(self, changes: FloatArray, one_sided: bool) -> _Result | None:
         """The test of a suspect's changes; None where the parameters do all that it does.
@@ -448,18 +484,14 @@ class _Regression:
         degrees of freedom as amplitudes turned out to be (Susko, "Likelihood ratio tests with
         boundary constraints using data-dependent degrees of freedom", Biometrika 100, 2013).
         """
-        white = self.whitening(changes)
-        size = np.linalg.norm(white, axis=0)
-        used = np.flatnonzero(size > 0.0)
-        if not len(used):
+        columns, size = self._scaled(changes)
+        if not columns.size:
             return None
-        columns = white[:, used] / size[used]
-        within, beyond = self._split(columns)
+        within, beyond = self._basis.split(columns)
         squares, axes = np.linalg.eigh(beyond.T @ beyond)
         new = squares > _NEW**2
         if not new.any():
             return None
-        pushes = self._pushes(columns, within)
         if one_sided:
             from scipy.optimize import nnls  # slow, and seldom needed
 
@@ -473,58 +505,108 @@ class _Regression:
             amplitudes = turn @ (turn.T @ (beyond.T @ self._residual))
         left = beyond @ turn
         score = left.T @ self._residual
-        move = -self._solved(within @ amplitudes)
+        move = -self._basis.solved(within @ amplitudes)
         whole = np.zeros(len(size))
-        whole[used] = amplitudes / size[used]
+        whole[size > 0.0] = amplitudes / size[size > 0.0]
         return _Result(
-            _log(float(chdtrc(freedom, self._statistic(left, score, turn.T @ pushes)))),
+            _log(float(chdtrc(freedom, self._statistic(left, score)))),
             whole,
             self._coefficients + move,
             move,
             min(float(score @ score) / max(self.squares, 1e-300), 1.0),
         )
 
-    def _statistic(self, left: FloatArray, score: FloatArray, pushes: FloatArray) -> float:
-        """The score's square in units of its covariance, in every direction the larger of three.
-
-        pushes: of the score by draws of the inputs' noise.
-        """
+    def _statistic(self, left: FloatArray, score: FloatArray) -> float:
+        """The score's square in units of its covariance, in every direction the larger of three."""
         rest = self._residual - left @ score
         terms = (left * rest[:, None])[: self._n]
         terms = terms.reshape(-1, self.whitening.n_outputs, len(score)).sum(axis=1)
         covariance = _long_run_covariance(terms - terms.mean(axis=0))
-        if pushes.size:
+        if self._noises:
+            pushes = self._pushes(left[: self._n])
             covariance = _larger(covariance, pushes @ pushes.T)
         return float(score @ np.linalg.solve(_larger(covariance, np.eye(len(score))), score))
 
-    def _pushes(self, columns: FloatArray, within: FloatArray) -> FloatArray:
-        """Scalar products of what is beyond the columns and the noise's changes, (k, n_draws).
-
-        What the regression's columns make of the noise is at right angles to what they leave.
-        """
-        pushes = [np.zeros((columns.shape[1], 0))]
-        for (rows, noise), noise_within in zip(self._noises, self._noises_within, strict=True):
-            part, push = columns[rows], -within.T @ noise_within
-            pushes.append(push + part.T @ noise if part.any() else push)
+    def _pushes(self, left: FloatArray) -> FloatArray:
+        """Changes of the score by draws of the inputs' noise, (k, n_draws of all records)."""
+        pushes = []
+        for rows, noise in self._noises:
+            back = self.whitening.transposed(rows, left[self.whitening.rows_of(rows)])
+            pushes.append(np.tensordot(back, noise, axes=([0, 1], [0, 1])))
         return np.hstack(pushes)
 
-    def _solved(self, within: FloatArray) -> FloatArray:
-        """Coefficients of the regression's columns from scalar products with its basis."""
-        solution: FloatArray = solve_triangular(self._triangle, within)
-        return solution
 
-    def _split(self, white: FloatArray) -> tuple[FloatArray, FloatArray]:
+class _Basis:
+    """Orthonormal basis of whitened columns (n_rows, p) and what is known of each beforehand.
+
+    free: (p,), as of ``_Regression``; below the rows of the columns stands one for each of them.
+    Columns that are in one record alone are factored there, the common ones by what those leave of
+    them (Frisch & Waugh, Econometrica 1, 1933): that takes no longer a record the more there are.
+    records: rows of each.
+    """
+
+    def __init__(self, white: FloatArray, free: FloatArray, records: Sequence[slice]) -> None:
+        self._n, self._records = len(white), records
+        felt = np.array([white[rows].any(axis=0) for rows in records])
+        alone = felt.sum(axis=0) == 1
+        self._places = [np.flatnonzero(alone & in_record) for in_record in felt]
+        self._common = np.flatnonzero(~alone)
+        common = np.vstack([white, np.diag(free)])[:, self._common]
+        self._bases, self._triangles, self._parts = [], [], []
+        for rows, places in zip(records, self._places, strict=True):
+            basis, triangle = np.linalg.qr(np.vstack([white[rows, places], np.diag(free[places])]))
+            count = rows.stop - rows.start
+            part = basis[:count].T @ common[rows]
+            common[rows] -= basis[:count] @ part
+            common[self._n + places] -= basis[count:] @ part
+            self._bases.append((basis[:count], basis[count:]))
+            self._triangles.append(triangle)
+            self._parts.append(part)
+        self._common_basis, self._common_triangle = np.linalg.qr(common)
+
+    def within(self, white: FloatArray, rows: slice) -> FloatArray:
+        """Scalar products with the basis, (p, k), of columns that are zero outside some rows."""
+        within = np.zeros((len(self._common_basis) - self._n, white.shape[1]))
+        within[self._common] = self._common_basis[rows].T @ white
+        for record, places, (basis, _) in zip(
+            self._records, self._places, self._bases, strict=True
+        ):
+            first, end = max(record.start, rows.start), min(record.stop, rows.stop)
+            if first < end and len(places):
+                part = white[first - rows.start : end - rows.start]
+                within[places] = basis[first - record.start : end - record.start].T @ part
+        return within
+
+    def split(self, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Scalar products of whitened columns with the basis, and what it leaves of them.
 
-        The latter with rows for what is known beforehand. What is in one record alone is read there
-        alone.
+        The latter with rows for what is known beforehand.
         """
-        rows = np.flatnonzero(white.any(axis=1))
-        first, end = (rows[0], rows[-1] + 1) if len(rows) else (0, 0)
-        within: FloatArray = self._basis[first:end].T @ white[first:end]
-        beyond: FloatArray = -(self._basis @ within)
-        beyond[first:end] += white[first:end]
+        rows = _span(white)
+        within = self.within(white[rows], rows)
+        beyond: FloatArray = -(self._common_basis @ within[self._common])
+        for record, places, (basis, below) in zip(
+            self._records, self._places, self._bases, strict=True
+        ):
+            beyond[record] -= basis @ within[places]
+            beyond[self._n + places] -= below @ within[places]
+        beyond[rows] += white[rows]
         return within, beyond
+
+    def solved(self, within: FloatArray) -> FloatArray:
+        """Coefficients (p,) of the columns from scalar products (p,) with the basis."""
+        solution = np.zeros_like(within)
+        common = solve_triangular(self._common_triangle, within[self._common])
+        solution[self._common] = common
+        for places, triangle, part in zip(self._places, self._triangles, self._parts, strict=True):
+            solution[places] = solve_triangular(triangle, within[places] - part @ common)
+        return solution
+
+
+def _span(white: FloatArray) -> slice:
+    """Rows from the first to the last in which columns are not zero."""
+    rows = np.flatnonzero(white.any(axis=1))
+    return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
 
 
 def _larger(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -599,13 +681,27 @@ class _Whitening:
     def of_record(self, rows: slice, columns: FloatArray) -> FloatArray:
         """Those of one record, (n_samples, n_outputs, k), by its rows of the residuals."""
         _, q, k = columns.shape
-        if not columns.any():
-            return np.zeros((q * int(self.kept[rows].sum()), k))
+        felt = columns.any(axis=(0, 1))
+        whole = np.zeros((q * int(self.kept[rows].sum()), k))
+        if not felt.any():
+            return whole
         order = len(self.model.coefficients)
-        flat = np.ascontiguousarray(columns).reshape(-1, k)
+        flat = np.ascontiguousarray(columns[..., felt]).reshape(len(columns) * q, -1)
         past = sliding_window_view(flat, (order + 1) * q, axis=0)[::q].swapaxes(1, 2)
         white: FloatArray = (self._filter @ past)[self.kept[rows][order:]]
-        return white.reshape(-1, k)
+        whole[:, felt] = white.reshape(len(whole), -1)
+        return whole
+
+    def transposed(self, rows: slice, white: FloatArray) -> FloatArray:
+        """What whitened columns of one record weigh its residuals by, (n_samples, n_outputs, k)."""
+        kept, order, q = self.kept[rows], len(self.model.coefficients), self.n_outputs
+        n, k = len(kept) - order, white.shape[1]
+        whole = np.zeros((n, q, k))
+        whole[kept[order:]] = white.reshape(-1, q, k)
+        back = np.zeros((len(kept), q, k))
+        for lag in range(order + 1):
+            back[lag : lag + n] += self._filter[:, lag * q : (lag + 1) * q].T @ whole
+        return back
 
     def rows_of(self, rows: slice) -> slice:
         """Rows of the whitened columns of one record, by its rows of the residuals."""
