@@ -12,17 +12,24 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from daq import record
 from daq.config.rig import RigConfig
 from daq.identification import records as datasets
 from daq.identification.campaign import Workers
+from daq.logs.capture import LOG_NAME
 from daq.lookup.experiments import load_experiment
 from daq.lookup.rigs import load_rig
+from daq.lookup.shipped import find_file
 from daq.provenance import software_versions
 from daq.run.runner import run_experiment
 from sim_rig.backend import SimulatedDevice
 from sysid import Dataset, StudyResult, study
 from sysid.problem.model import ProcessModel
 from sysid.threads import available_cores
+
+_SEEDS = 1000  # between those of one PRBS and the next
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
@@ -117,3 +124,19 @@ def simulated_logs(
             run = run_experiment(item.experiment, item.name, rig, device, Path(folder))
             records.append(datasets.load(run.folder, model, None).dataset)
     return records[0], records[-1]
+
+
+def prbs_logs(
+    folder: Path, count: int, rig: Path | str = "simulated.yaml", seed: int = 0
+) -> list[Path]:
+    """Files of logs of the shipped PRBS, a sequence and a seed of the rig's noise each."""
+    content = yaml.safe_load(find_file("protocol", "prbs.yaml").read_text(encoding="utf-8"))
+    logs = []
+    for k in range(count):
+        for j, channel in enumerate(("motor", "brake")):
+            content[channel]["seed"] = 1 + _SEEDS * (2 * k + j)
+        experiment = folder / f"prbs-{k}.yaml"
+        experiment.write_text(yaml.safe_dump(content))
+        run = record(experiment, rig, folder / "prbs", options={"seed": seed + k})
+        logs.append(run.folder / LOG_NAME)
+    return logs

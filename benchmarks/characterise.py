@@ -22,14 +22,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from benchmarks._common import arguments, report
-from daq import record
+from benchmarks._common import arguments, prbs_logs, report
 from daq.characterise import characterise
 from daq.characterise.rounds import Interval, Round
 from daq.identification.fit import fit
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
-from daq.logs.capture import LOG_NAME
 from daq.lookup.models import DRIVEN_MODEL, find_model
 from daq.lookup.shipped import find_file
 from sim_rig.actuator import actuator
@@ -39,7 +37,7 @@ from sysid.problem.space import SearchSpace
 
 RUNS = 8
 FACTORS = 0.6, 1.6
-SEEDS = 1000  # between those of one run of the PRBS and the next
+SEEDS = 1000  # between those of one rig's runs and the next
 
 
 def main() -> None:
@@ -123,16 +121,8 @@ def _rig_file(folder: Path, number: int, truth: dict[str, float]) -> Path:
 
 def _shipped(folder: Path, rig: Path, last: Round, number: int, model: str) -> dict[str, Interval]:
     """Intervals of the same quantities from runs of the shipped PRBS."""
-    content = yaml.safe_load(find_file("protocol", "prbs.yaml").read_text(encoding="utf-8"))
-    logs = []
-    for k in range(RUNS):
-        for j, channel in enumerate(("motor", "brake")):
-            content[channel]["seed"] = 1 + SEEDS * (2 * k + j)
-        experiment = folder / f"prbs-{k}.yaml"
-        experiment.write_text(yaml.safe_dump(content))
-        # The same seed would be the same noise in each.
-        options = {"seed": SEEDS * (number + 1) + k}
-        logs.append(record(experiment, rig, folder / "prbs", options=options).folder / LOG_NAME)
+    # The same seed would be the same noise in each.
+    logs = prbs_logs(folder, RUNS, rig, SEEDS * (number + 1))
     identification = Round(folder / "shipped", 1)
     identification.folder.mkdir(parents=True)
     (identification.folder / "design.json").write_bytes((last.folder / "design.json").read_bytes())

@@ -1,16 +1,19 @@
 """How long a user waits: commands timed as whole processes, warm, beside the bars.
 
 python -m benchmarks.waiting [--json] [--base COMMIT] [--runs 3] [--first] [COMMAND ...]
+python -m benchmarks.waiting [--json] [--base COMMIT] [--runs 3] --logs 1,4,8
 
 Seconds by the clock and of the processors (which hardly depend on what else the machine does), to
 the last line of the printed tables and to the end; the least of some runs. --base: the same of
 another commit, its sources in a worktree of their own, turn by turn with these. --first: the run
-that compiles, too. Not on Windows. The search alone is timed by ``benchmarks.identification``.
+that compiles, too. --logs: so many logs identified jointly instead, a PRBS each. Not on Windows.
+The search alone is timed by ``benchmarks.identification``.
 """
 
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -21,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks._common import arguments, report
+from benchmarks._common import arguments, prbs_logs, report
 
 _ROOT = Path(__file__).parent.parent
 _TABLE = b"Parameters: "  # stands below the tables
@@ -34,14 +37,15 @@ _MEASURES = ("table", "table_cpu", "whole", "whole_cpu")
 class Command:
     """Words behind ``rig``, and bars in seconds by the clock on two quiet cores.
 
-    {run}, {validation}: folders of runs; {parameters}: identified from them. table: to the
-    printed tables. first: whether nothing is compiled yet.
+    {run}, {validation}: folders of runs; {parameters}: identified from them; {logs}: as many logs
+    as ``logs`` says. table: to the printed tables. first: whether nothing is compiled yet.
     """
 
     words: str
     whole: float | None
     table: float | None = None
     first: bool = False
+    logs: int = 0
 
 
 COMMANDS = {
@@ -52,6 +56,7 @@ COMMANDS = {
     "models": Command("models", 0.5),
 }
 FIRST = {"first": Command("run prbs.yaml --identify", 25.0, first=True)}
+JOINT_BARS = {8: 6.0}  # by number of logs
 
 
 def main() -> None:
@@ -60,19 +65,31 @@ def main() -> None:
     parser.add_argument("--base", metavar="COMMIT", help="time the same of another commit, too")
     parser.add_argument("--runs", type=int, default=3, help="of which the least counts")
     parser.add_argument("--first", action="store_true", help="the run that compiles, too")
+    parser.add_argument("--logs", help="numbers of logs that are identified jointly, as 1,4,8")
     options = parser.parse_args()
     if unknown := set(options.commands) - set(COMMANDS):
         parser.error(f"no command {', '.join(unknown)}; there are {', '.join(COMMANDS)}")
     commands = {name: COMMANDS[name] for name in options.commands or COMMANDS}
+    if options.logs:
+        counts = list(map(int, options.logs.split(",")))
+        commands = {f"{count} logs": _joint(count) for count in counts}
     with _sources(options.base) as base, tempfile.TemporaryDirectory() as folder:
         trees = {"here": _ROOT} | ({} if base is None else {options.base: base})
+        most = max(command.logs for command in commands.values())
+        logs = prbs_logs(Path(folder), most)
         places = {name: _prepared(tree, Path(folder) / str(k))
                   for k, (name, tree) in enumerate(trees.items())}  # fmt: skip
         figures = {
-            name: _least(command, trees, places, 1 if command.first else options.runs)
+            name: _least(command, trees, places, logs, 1 if command.first else options.runs)
             for name, command in {**commands, **(FIRST if options.first else {})}.items()
         }
     report({"waiting": figures}, options.json, show)
+
+
+def _joint(count: int) -> Command:
+    return Command(
+        "identify {logs} --out identified", None, table=JOINT_BARS.get(count), logs=count
+    )
 
 
 @contextmanager
@@ -104,13 +121,19 @@ def _prepared(tree: Path, place: Path) -> dict[str, str]:
 
 
 def _least(
-    command: Command, trees: dict[str, Path], places: dict[str, dict[str, str]], runs: int
+    command: Command,
+    trees: dict[str, Path],
+    places: dict[str, dict[str, str]],
+    logs: list[Path],
+    runs: int,
 ) -> dict[str, Any]:
     """Least seconds of some runs by each tree's sources, turn by turn, and the bars."""
     measured: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
     for _ in range(runs):
         for name, tree in trees.items():
-            words = [word.format(**places[name]) for word in command.words.split()]
+            some = shlex.join(str(log) for log in logs[: command.logs])
+            quoted = {key: shlex.quote(value) for key, value in places[name].items()}
+            words = shlex.split(command.words.format(**quoted, logs=some))
             nowhere = tempfile.TemporaryDirectory() if command.first else nullcontext(None)
             with nowhere as cache:
                 measured[name].append(_timed(words, tree, Path(places[name]["place"]), cache))
