@@ -6,6 +6,7 @@ compiled model with a further input added to every equation tells what any funct
 equation would do: the function's values along the run are that input's samples.
 """
 
+import functools
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ _BASE_STEPS = 2
 _SMALL = 1e-3  # a disturbance in parts of what it is added to
 
 
+@functools.lru_cache(maxsize=8)  # one model for all records: its kernels are kept by it
 def with_added_inputs(model: ProcessModel) -> ProcessModel:
     """The model with an input added to each state's rate, and all its states among the outputs.
 

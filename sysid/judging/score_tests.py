@@ -445,8 +445,9 @@ class _Regression:
         self.whitening = whitening
         white, target = whitening(columns), whitening(residual[..., None])
         self._n = len(target)
-        rows_of_records = [whitening.rows_of(rows) for rows in record_rows(whitening.lengths)]
-        self._basis = _Basis(white, free, rows_of_records)
+        self._basis = _Basis(
+            white, free, [whitening.rows_of(r) for r in record_rows(whitening.lengths)]
+        )
         within, beyond = self._basis.split(target)
         self._coefficients, self._residual = self._basis.solved(within[:, 0]), beyond[:, 0]
         self._noises = noises
@@ -675,16 +676,22 @@ class _Whitening:
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """The whitened columns, rows of outputs one after another."""
-        parts = [self.of_record(rows, columns[rows]) for rows in record_rows(self.lengths)]
-        return np.concatenate(parts)
+        whole = np.zeros((self.n_outputs * int(self.kept.sum()), columns.shape[2]))
+        for rows, places in self._records:
+            if columns[rows].any():
+                whole[places] = self.of_record(rows, columns[rows])
+        return whole
+
+    @cached_property
+    def _records(self) -> list[tuple[slice, slice]]:
+        """Each record's rows of the residuals and of the whitened columns."""
+        return [(rows, self.rows_of(rows)) for rows in record_rows(self.lengths)]
 
     def of_record(self, rows: slice, columns: FloatArray) -> FloatArray:
         """Those of one record, (n_samples, n_outputs, k), by its rows of the residuals."""
         _, q, k = columns.shape
         felt = columns.any(axis=(0, 1))
         whole = np.zeros((q * int(self.kept[rows].sum()), k))
-        if not felt.any():
-            return whole
         order = len(self.model.coefficients)
         flat = np.ascontiguousarray(columns[..., felt]).reshape(len(columns) * q, -1)
         past = sliding_window_view(flat, (order + 1) * q, axis=0)[::q].swapaxes(1, 2)
