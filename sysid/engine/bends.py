@@ -28,6 +28,31 @@ def bent(model: ProcessModel) -> ProcessModel:
     return replace(model, inputs=tuple(inputs))
 
 
+def in_parts(model: ProcessModel, inputs: FloatArray, parts: int) -> FloatArray:
+    """Inputs as of ``with_bends`` of all splines in parts of samples, (parts (n_samples - 1) + 1,).
+
+    >>> from sysid.examples import lag
+    >>> model = lag().with_holds({"u": "spline"})
+    >>> in_parts(model, np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]), 2)
+    array([[ 0.   ,  0.25 ,  0.125],
+           [-0.125,  0.625,  0.125],
+           [ 1.   ,  0.   ,  0.   ]])
+    """
+    samples, steps = np.divmod(np.arange((len(inputs) - 1) * parts + 1), parts)
+    r = steps / parts
+    fine, behind = inputs[samples], inputs[np.minimum(samples + 1, len(inputs) - 1)]
+    for j, signal in enumerate(model.inputs):
+        if signal.hold != "zoh":
+            fine[:, j] += r * (behind[:, j] - fine[:, j])
+    for place, j in enumerate(splines_of(model)):
+        square, cube = fine[:, len(model.inputs) + 2 * place :].T[:2]
+        fine[:, j] += r * (r - 1.0) * (square + cube * (r + 1.0))
+        square += 3.0 * r * cube
+        square /= parts**2
+        cube /= parts**3
+    return fine
+
+
 def with_bends(model: ProcessModel, record: Dataset, splines: Sequence[int]) -> FloatArray:
     """Inputs of a record, and behind them a and b of each of the splines, by their places.
 

@@ -6,12 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.engine.bends import splines_of, with_bends
+from sysid.engine.bends import in_parts, splines_of, with_bends
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
 from sysid.engine.scheme import LANES, work_area
 from sysid.engine.windows import (
+    Ends,
+    add_beyond,
     average,
     compared,
+    ends_of,
     weights_of_mean,
     weights_of_sums,
     with_integrals,
@@ -38,6 +41,8 @@ _PILOT_LEAST = 32  # samples
 # each one's result depends on nothing but itself.
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
 _ALL_LANES = np.arange(LANES)
+_PARTS = 8  # of a sample, in which a free run tells what averaged outputs are but no parabola
+_AT_ONCE = 1024  # samples of which that many are kept
 _BEFORE = 1e-6  # samples before its first by which a window may begin for the arithmetic's sake
 
 
@@ -93,6 +98,7 @@ class RecordSimulator:
             windows = record.windows / record.dt  # in samples
         self.averaged = np.flatnonzero(windows.any(axis=(0, 2))).tolist()
         self._windows = np.ascontiguousarray(np.moveaxis(windows, 1, 0))
+        self._in_parts: tuple[FloatArray, dict[int, Ends]] | None = None
         self._steps_of: dict[bytes, int] = {}
         self._means_of: dict[tuple[tuple[int, ...], bool], _Means] = {}
         self._inputs_of: dict[tuple[int, ...], FloatArray] = {}
@@ -187,6 +193,7 @@ class RecordSimulator:
         process: FloatArray,
         colour: FloatArray,
         corrects: bool,
+        exact: bool,
         parameters: FloatArray,
         starts: FloatArray | None,
         rows: slice,
@@ -198,7 +205,8 @@ class RecordSimulator:
         noise: (n_outputs,), standard deviations; scatter: (n_samples, n_outputs), variances of
         single samples beside it. process: (n_states,), standard deviations of the states' rates
         over the root of a second. colour: (n_inputs,), how much of the inputs' noise goes on from
-        sample to sample. corrects: whether the filter takes outputs in. A state that
+        sample to sample. corrects: whether the filter takes outputs in. exact: whether means are
+        what free runs say, of outputs that are no parabolas between samples. A state that
         starts at the first sample of an output has that sample's error. Returns with the sums of
         squares those of the logarithms of the innovations' variances in parts of the outputs',
         (n, n_outputs).
@@ -228,6 +236,8 @@ class RecordSimulator:
             self._inputs_of[tuple(kernel.splines)] = inputs
         weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
+        if exact:
+            measured -= self.beyond_parabolas(parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, inputs, measured, weights,
@@ -276,9 +286,12 @@ class RecordSimulator:
         """
         if self.averaged:
             return self._averaged_block(parameters, starts, lanes, n_steps, n_samples, residuals)
-        signals = self._measured[:n_samples], self._weights[:n_samples]
-        start = self._initial(starts, lanes)
-        return self._run(self.kernels, parameters, start, lanes, n_steps, signals, residuals)
+        run = tuple(part[:n_samples] for part in (self._inputs, self._measured, self._weights))
+        start, dt = self._initial(starts, lanes), self.record.dt
+        sums, estimates, _ = self._run(
+            self.kernels, parameters, start, lanes, dt, n_steps, run, residuals
+        )
+        return sums, estimates
 
     def _means(self, averaged: Sequence[int], corrects: bool) -> _Means:
         """Weights (n_samples, n_outputs, 2, 4) as of ``weights_of_sums`` for a filter.
@@ -329,6 +342,40 @@ class RecordSimulator:
                     measured[:, j] += last - average(output, integral, self._windows[j])
         return measured
 
+    def beyond_parabolas(
+        self,
+        parameters: FloatArray,
+        starts: FloatArray | None,
+        lanes: IntArray,
+        n_steps: int,
+    ) -> FloatArray:
+        """By how much means of free runs are not those of parabolas between samples.
+
+        (n_samples, n_outputs, LANES).
+        """
+        beyond = np.zeros((*self._measured.shape, LANES))
+        if not self.averaged:
+            return beyond
+        if self._in_parts is None:
+            ends = {j: ends_of(self._windows[j]) for j in self.averaged}
+            self._in_parts = in_parts(self.kernels.model, self._inputs, _PARTS), ends
+        (inputs, ends), dt, steps = self._in_parts, self.record.dt / _PARTS, -(-n_steps // _PARTS)
+        state = self._integrating_start(starts, lanes)
+        q = self._measured.shape[1]
+        kept = np.empty((_AT_ONCE * _PARTS + 1, q + len(self.averaged), LANES))
+        signals = np.zeros(kept.shape[:2]), np.ones(kept.shape[:2])
+        for first in range(0, self.record.n_samples - 1, _AT_ONCE):
+            part = inputs[first * _PARTS :][: len(kept)]
+            run = part, *(signal[: len(part)] for signal in signals)
+            outputs = kept[: len(part)]
+            *_, state = self._run(
+                self._integrating, parameters, state, lanes, dt, steps, run, outputs
+            )
+            for m, j in enumerate(self.averaged):
+                integral = outputs[:, q + m] / dt
+                add_beyond(beyond[:, j], ends[j], first, _PARTS, outputs[:, j], integral)
+        return beyond
+
     def _integrated(
         self,
         parameters: FloatArray,
@@ -345,11 +392,18 @@ class RecordSimulator:
         q, more = self._measured.shape[1], len(self.averaged)
         kept = np.empty((n_samples, q + more, LANES))
         signals = np.zeros((n_samples, q + more)), np.ones((n_samples, q + more))
-        start = np.vstack([self._initial(starts, lanes), np.zeros((more, len(lanes)))])
-        integrating = self._integrating
-        _, estimates = self._run(integrating, parameters, start, lanes, n_steps, signals, kept)
-        integrals = [kept[:, q + i] / self.record.dt for i in range(more)]
+        start, dt = self._integrating_start(starts, lanes), self.record.dt
+        run = self._inputs[:n_samples], *signals
+        _, estimates, _ = self._run(
+            self._integrating, parameters, start, lanes, dt, n_steps, run, kept
+        )
+        integrals = [kept[:, q + i] / dt for i in range(more)]
         return kept[:, :q], integrals, estimates[:, :q]
+
+    def _integrating_start(self, starts: FloatArray | None, lanes: IntArray) -> FloatArray:
+        """Initial states of the model with integrals, (n_states, n_lanes)."""
+        nothing = np.zeros((len(self.averaged), len(lanes)))
+        return np.vstack([self._initial(starts, lanes), nothing])
 
     def _averaged_block(
         self,
@@ -377,23 +431,25 @@ class RecordSimulator:
         parameters: FloatArray,
         start: FloatArray,
         lanes: IntArray,
+        dt: float,
         n_steps: int,
-        signals: tuple[FloatArray, FloatArray],
+        record: tuple[FloatArray, ...],
         residuals: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """As ``block``, of outputs at their instants.
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As ``block``, of outputs at their instants, and the states in the end.
 
-        start: (n_states, n) of the kernels' model. signals: its measured outputs and weights.
+        start: (n_states, n) of the kernels' model. record: inputs, and of this model measured
+        outputs and weights, at samples that are dt apart.
         """
         padded = lanes.take(_ALL_LANES, mode="wrap")
         start = np.ascontiguousarray(start.take(_ALL_LANES, axis=1, mode="wrap"))
-        n_outputs = signals[0].shape[1]
+        n_outputs = record[1].shape[1]
         sums = np.empty((2 * n_outputs, LANES))
         work = work_area(kernels.batch.work_rows * LANES)
-        record = self._inputs[: len(signals[0])], *signals
+        rows = work.reshape(-1, LANES)
         arguments = (
-            work, work.reshape(-1, LANES), kernels.batch.tables, *record, start,
-            np.ascontiguousarray(parameters[padded].T), self.record.dt, n_steps, sums, residuals,
+            work, rows, kernels.batch.tables, *record, start,
+            np.ascontiguousarray(parameters[padded].T), dt, n_steps, sums, residuals,
         )  # fmt: skip
         with explained_errors(kernels.model):
             kernels.simulate(*arguments)
@@ -401,7 +457,8 @@ class RecordSimulator:
                 # When all have blown up it stops, and leaves the rest as it is.
                 residuals.fill(np.nan)
                 kernels.simulate(*arguments)
-        return sums[:n_outputs].T[: len(lanes)], sums[n_outputs:].T[: len(lanes)]
+        squares, estimates = (half.T[: len(lanes)] for half in np.split(sums, 2))
+        return squares, estimates, rows[: len(start), : len(lanes)]
 
     def _attempt(self, population: Population, todo: IntArray, n_samples: int) -> FloatArray:
         """Simulate part of a population, at its steps; error estimates in parts of the allowed."""
@@ -409,7 +466,7 @@ class RecordSimulator:
         tasks = [
             (lanes, int(rung))
             for rung in np.unique(steps[todo])[::-1]
-            for lanes in _blocks(todo[steps[todo] == rung])
+            for lanes in blocks_of(todo[steps[todo] == rung])
         ]
         estimates = np.zeros_like(population.sse)
         nothing = np.empty((0, 0, 0))
@@ -452,7 +509,7 @@ class RecordSimulator:
                 self.kernels.spectrum(self._extremes, states, p, rate)
             rates[lanes] = rate
 
-        self.workers.each(run, _blocks(np.arange(len(parameters))))
+        self.workers.each(run, blocks_of(np.arange(len(parameters))))
         return rates
 
     def _initial(self, starts: FloatArray | None, lanes: IntArray) -> FloatArray:
@@ -476,5 +533,6 @@ def _rungs(steps: FloatArray) -> IntArray:
     return np.where(wanted > _LADDER[-1], np.iinfo(np.int64).max, _LADDER[rung])
 
 
-def _blocks(lanes: IntArray) -> list[IntArray]:
+def blocks_of(lanes: IntArray) -> list[IntArray]:
+    """Lanes in groups that are simulated at once."""
     return [lanes[i : i + LANES] for i in range(0, len(lanes), LANES)]

@@ -11,7 +11,7 @@ import numpy as np
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.bends import bent
 from sysid.engine.compiler import kalman_filter, kernels, tangents
-from sysid.engine.record_simulator import RecordSimulator
+from sysid.engine.record_simulator import RecordSimulator, blocks_of
 from sysid.engine.scheme import LANES
 from sysid.engine.windows import with_integrals
 from sysid.problem.data import Dataset
@@ -210,6 +210,7 @@ class BatchSimulator:
         process: FloatArray | None = None,
         colour: Sequence[FloatArray] | None = None,
         corrects: bool = True,
+        exact: bool = False,
         balanced: bool = True,
     ) -> Residuals:
         """As ``residuals``, of the innovations of an extended Kalman filter.
@@ -223,7 +224,9 @@ class BatchSimulator:
         innovations are the residuals. With noise of the process, where ``balanced``, all of an
         output are multiplied by the geometric mean of those deviations: their sum of squares is
         then least where the likelihood of an output of unknown noise is largest. Unless it
-        ``corrects`` itself by the outputs, they are those of the free run, scaled so. See
+        ``corrects`` itself by the outputs, they are those of the free run, scaled so. Averaged
+        outputs are taken for parabolas between samples, unless means are to be ``exact`` to what
+        free runs tell of how they run there. See
         ``filter_kernel``. Raises ModelError for equations that cannot be differentiated.
         """
         process = np.zeros(len(self.model.states)) if process is None else process
@@ -244,8 +247,8 @@ class BatchSimulator:
         ) -> tuple[FloatArray, FloatArray]:
             values = part[..., rows]
             sse, logarithms[rows, r] = simulator.innovations(
-                kalman, noise, scatter[r], process, colours[r], corrects, parameters, starts[r],
-                rows, steps, values,
+                kalman, noise, scatter[r], process, colours[r], corrects, exact, parameters,
+                starts[r], rows, steps, values,
             )  # fmt: skip
             return sse, np.where(np.isfinite(sse).all(axis=1), 0.0, np.inf)
 
@@ -260,6 +263,26 @@ class BatchSimulator:
             values=innovations.values * factor.T,
             sse=innovations.sse * factor[:, None] ** 2,
         )
+
+    def beyond_parabolas(
+        self,
+        parameters: FloatArray,
+        record: Dataset,
+        n_steps: int | None = None,
+        starts: FloatArray | None = None,
+    ) -> FloatArray:
+        """By how much simulated means over windows are not those of parabolas between samples.
+
+        As which outputs are averaged, though behind a step of an input they may run otherwise.
+        Arguments and result, (n, n_samples, n_outputs), as of ``trajectories``.
+        """
+        parameters = self._check(parameters, [record])
+        n_steps = n_steps or int(self.steps_of_each(parameters, record, starts).max())
+        blocks = [
+            self._on(record).beyond_parabolas(parameters, starts, lanes, n_steps)[..., : len(lanes)]
+            for lanes in blocks_of(np.arange(len(parameters)))
+        ]
+        return np.ascontiguousarray(np.moveaxis(np.concatenate(blocks, axis=2), 2, 0))
 
     def tangents(
         self,

@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.model import Output, ProcessModel, State, picker
+
+# Of windows' ends within samples the sample, its part that has passed, the mean's row, the weight
+# there of the area up to it, and whether the window is an instant, of the value itself.
+Ends = tuple[IntArray, FloatArray, IntArray, FloatArray, BoolArray]
 
 _INSTANT = 1e-6  # samples that no window is shorter than, unless it is an instant
 
@@ -145,6 +149,57 @@ def weights_of_sums(windows: FloatArray, seen: BoolArray) -> FloatArray | None:
         weights[i, 1, :3] = [0.0, 0.0, 1.0] - part
         weights[i + 1 : k, 1, 2:] = 1.0
     return weights
+
+
+def ends_of(windows: FloatArray) -> Ends:
+    """Where windows (n_samples, 2), as of ``average``, begin and end within samples."""
+    n = len(windows)
+    times = np.clip(np.arange(n)[:, None] + windows, 0.0, n - 1.0)
+    length = np.diff(times, axis=1)
+    instant = length < _INSTANT
+    samples = np.minimum(np.floor(times), n - 2.0)
+    places = times - samples
+    weights = np.where(instant, [0.0, 1.0], [-1.0, 1.0] / np.where(instant, 1.0, length))
+    within = (weights != 0.0) & (places > 0.0) & (places < 1.0)
+    rows, _ = np.nonzero(within)
+    order = np.argsort(samples[within], kind="stable")
+    rows, chosen = rows[order], samples[within][order].astype(np.int64)
+    return chosen, places[within][order], rows, weights[within][order], instant[rows, 0]
+
+
+@njit(cache=True, nogil=True)
+def add_beyond(
+    means: FloatArray,
+    ends: Ends,
+    first: int,
+    parts: int,
+    outputs: FloatArray,
+    integrals: FloatArray,
+) -> None:
+    """Add to means (n_samples, n_lanes) what they are more than if of parabolas between samples.
+
+    Of those ends that lie in the samples from the first on that are given in parts: outputs and
+    their integrals over the time of a part, (parts n + 1, n_lanes).
+    """
+    samples, places, rows, weights, instants = ends
+    count = (len(outputs) - 1) // parts
+    for e in range(np.searchsorted(samples, first), np.searchsorted(samples, first + count)):
+        begin, row, weight = (samples[e] - first) * parts, rows[e], weights[e]
+        end, part = begin + parts, min(int(places[e] * parts), parts - 1)
+        i, s = begin + part, places[e] * parts - part
+        if instants[e]:
+            (f0, f1, area), (c0, c1, whole) = _parabola_at(s), _parabola_at(places[e])
+            all_of = 0.0
+        else:
+            (f0, f1, area), (c0, c1, whole) = _area_at(s), _area_at(places[e])
+            f0, f1, area, all_of = f0 / parts, f1 / parts, area / parts, 1.0 / parts
+        for lane in range(outputs.shape[1]):
+            fine = f0 * outputs[i, lane] + f1 * outputs[i + 1, lane]
+            fine += area * (integrals[i + 1, lane] - integrals[i, lane])
+            fine += all_of * (integrals[i, lane] - integrals[begin, lane])
+            coarse = c0 * outputs[begin, lane] + c1 * outputs[end, lane]
+            coarse += whole / parts * (integrals[end, lane] - integrals[begin, lane])
+            means[row, lane] += weight * (fine - coarse)
 
 
 @njit(cache=True, nogil=True)

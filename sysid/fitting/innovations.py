@@ -55,6 +55,9 @@ _DRAWS, _BENT = 8, 0.1
 # Integration steps of a free run that one of a filter may stand for, and by how many deviations of
 # any quantity the difference may move it where an answer is at stake.
 _COARSER, _MOVING = (3, 2), 0.2
+# Deviations by which parabolas for averaged outputs may move any quantity: intervals count it. And
+# changes of search coordinates, in parts of their ranges, that tell slopes in spite of small kinks.
+_OFF, _MOVE = 1.5, 1e-3
 _FEWEST = 2  # a sample, where a free run takes more
 
 
@@ -67,7 +70,7 @@ class Innovations(Objective):
     over the root of a second. scatter: per record, (n_samples, n_outputs), variances of single
     samples beside the noise, by the jitter of their windows. Where it corrects, the records have
     each mean over a window once. coarseness: integration steps of a free run that one of the
-    filter's stands for.
+    filter's stands for. exact: whether averages are not of parabolas between samples.
     """
 
     noise: FloatArray
@@ -78,6 +81,7 @@ class Innovations(Objective):
     colour: list[FloatArray]
     quiet: bool
     coarseness: int
+    exact: bool
 
     @classmethod
     def of(
@@ -106,7 +110,7 @@ class Innovations(Objective):
             variant.records, variant.colour = [q.record for q in parts], [q.colour for q in parts]
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.scatter = [scatter(record) for record in variant.records]
-        variant.corrects, variant.coarseness = corrects, 1
+        variant.corrects, variant.coarseness, variant.exact = corrects, 1, False
         n_states = len(objective.simulator.model.states)
         variant.process = np.zeros(n_states) if process is None else process
         return variant
@@ -131,20 +135,45 @@ class Innovations(Objective):
         return variant.settled(chromosome).eased(chromosome)
 
     def eased(self, chromosome: FloatArray, moving: float = _MOVING) -> Self:
-        """With as few integration steps as tell the same at a chromosome, (n_free,).
+        """With as little effort as tells the same at a chromosome, (n_free,).
 
         moving: deviations of any quantity that the difference may move it by.
         Errors of a free run's steps add up over its memory; a filter forgets them, as its outputs
-        correct it, and noise covers what is left of them.
+        correct it, and noise covers what is left of them. That outputs are no parabolas between
+        samples comes again with the inputs: noise covers it in short records alone.
         """
         if not self.corrects:
             return self
-        exact = self._with(coarseness=1)._in_noise(chromosome)
+        eased = self._with(coarseness=1, exact=False)
+        told = eased._in_noise(chromosome)
         for coarseness in _COARSER:
-            coarser = self._with(coarseness=coarseness)
-            if np.linalg.norm(coarser._in_noise(chromosome) - exact) < moving:
-                return coarser
-        return self
+            coarser = eased._with(coarseness=coarseness)
+            if np.linalg.norm(coarser._in_noise(chromosome) - told) < moving:
+                eased = coarser
+                break
+        exact = eased._with(exact=True)
+        missed = exact._in_noise(chromosome) - eased._in_noise(chromosome)
+        return eased if eased._moved_by(missed, chromosome) < _OFF else exact
+
+    def _moved_by(self, change: FloatArray, chromosome: FloatArray) -> float:
+        """Deviations that a change of the innovations moves any quantity by, at most.
+
+        change: (n_residuals, n_outputs), in parts of the noise. chromosome: (n_free,).
+        """
+        if not np.linalg.norm(change) > _OFF:
+            return 0.0
+        lower, upper = self.space.coded_bounds
+        at = self.space.encode(chromosome)
+        inwards = np.where(at < 0.5 * (lower + upper), _MOVE, -_MOVE) * (upper - lower)
+        moved = self.space.decode(np.vstack([at, at + np.diag(inwards)]))
+        steps = np.repeat(self.steps_needed(chromosome[None]), len(moved), axis=0)
+        values = self._simulated(moved, steps, balanced=False).values
+        slopes = (values[..., 1:] - values[..., :1]) / self._noise_of_each()[..., None]
+        slopes = slopes.reshape(-1, len(chromosome))
+        lengths = np.linalg.norm(slopes, axis=0)
+        felt = np.isfinite(lengths) & (lengths > 0.0)
+        directions, _ = np.linalg.qr(slopes[:, felt] / lengths[felt])
+        return float(np.linalg.norm(directions.T @ change.ravel()))
 
     def _in_noise(self, chromosome: FloatArray) -> FloatArray:
         """Innovations (n_residuals, n_outputs) at (n_free,) in parts of the outputs' noise."""
@@ -309,6 +338,7 @@ class Innovations(Objective):
             process=self.process,
             colour=self.colour,
             corrects=self.corrects,
+            exact=self.exact,
             balanced=balanced,
         )
 

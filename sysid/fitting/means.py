@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
-from sysid.engine.simulation import BatchSimulator
-from sysid.engine.windows import average
 from sysid.problem.data import Dataset
-from sysid.problem.model import ProcessModel
 
 _SAME = 1e-6  # samples by which windows of one mean differ for the arithmetic's sake
 _INSIDE = 1e-3  # samples behind the end of a sample where a window that is cut begins
@@ -18,7 +15,6 @@ _OVERLAP, _FEW = 1.0, 0.05
 # Of the mean square of the slopes around, which that beside a mean is taken for at least: where it
 # seems to rest, between two turns, it does not.
 _AROUND = 0.5
-_FINE = 8  # parts of a sample that tell how an output runs within it
 
 
 def each_mean_once(record: Dataset) -> Dataset:
@@ -102,51 +98,6 @@ def scatter(record: Dataset) -> FloatArray:
         place = np.searchsorted(firsts, np.arange(len(rows)), side="right") - 1
         variances[rows, j] = squares[place] * record.jitter[rows, j] ** 2
     return variances
-
-
-def as_parabolas(
-    simulator: BatchSimulator, record: Dataset, parameters: FloatArray, start: FloatArray
-) -> Dataset:
-    """The record with its means as if outputs were parabolas between samples.
-
-    As which they are averaged, though behind a step of an input an output may run otherwise. By
-    how much a free run tells. parameters: (n_parameters,); start: (n_states,), where it begins.
-    Nothing changes where it is not finite.
-    """
-    if not record.windows.size:
-        return record
-    # It loads scipy.optimize, which takes a tenth of a second.
-    from scipy.integrate import cumulative_simpson
-
-    model, inputs = simulator.model, _finely(simulator.model, record.inputs)
-    blank = Dataset(inputs, np.full((len(inputs), len(model.outputs)), np.nan), record.dt / _FINE)
-    run = simulator.trajectories(parameters, blank, starts=start[None])[0]
-    outputs = record.outputs.copy()
-    for j in np.flatnonzero(record.windows.any(axis=(0, 2))).tolist():
-        fine, windows = run[:, j], record.windows[:, j] / record.dt
-        values = np.stack([fine[i : len(fine) - _FINE + i : _FINE] for i in range(_FINE)], axis=1)
-        values = np.column_stack([values, fine[_FINE::_FINE]])
-        areas = cumulative_simpson(values, dx=1.0, axis=1, initial=0.0)
-        sums = np.append(0.0, np.cumsum(areas[:, -1]))
-        within = np.append((sums[:-1, None] + areas[:, :-1]).ravel(), sums[-1])
-        finely = np.zeros((len(fine), 2))
-        finely[::_FINE] = windows * _FINE
-        parabolas = average(fine[::_FINE, None], sums[:, None] / _FINE, windows)[:, 0]
-        means = average(fine[:, None], within[:, None], finely)[::_FINE, 0]
-        outputs[:, j] += np.nan_to_num(parabolas - means, nan=0.0, posinf=0.0, neginf=0.0)
-    return replace(record, outputs=outputs)
-
-
-def _finely(model: ProcessModel, inputs: FloatArray) -> FloatArray:
-    """Inputs (n_samples, n_inputs) in parts of samples, as they run between these."""
-    rows = np.arange((len(inputs) - 1) * _FINE + 1) / _FINE
-    columns = [
-        column[rows.astype(np.int64)]
-        if signal.hold == "zoh"
-        else np.interp(rows, np.arange(len(column)), column)
-        for signal, column in zip(model.inputs, inputs.T, strict=True)
-    ]
-    return np.column_stack(columns)
 
 
 def _mean_around(between: FloatArray) -> FloatArray:

@@ -9,7 +9,6 @@ from scipy.special import ndtr
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.innovations import Innovations
-from sysid.fitting.means import as_parabolas
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.uncertainty.colour import record_rows
@@ -193,14 +192,18 @@ def parabola_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     It repeats itself with the inputs, so that more samples do not average it away.
     """
     objective, change = sensitivity.objective, np.zeros_like(sensitivity.residual)
-    simulator, space = objective.simulator, objective.space
-    chromosomes = sensitivity.chromosome[None]
-    vector = space.full(chromosomes)[0]
+    if isinstance(objective, Innovations) and objective.exact:
+        return
+    simulator, chromosomes = objective.simulator, sensitivity.chromosome[None]
+    vectors = objective.space.full(chromosomes)
     for k, record in enumerate(objective.records):
-        start = space.starts(chromosomes, k, record.initial_state(simulator.model))[0]
-        otherwise = as_parabolas(simulator, record, vector, start)
-        if otherwise is not record:
-            change += _change_by_record(sensitivity, k, otherwise) * sensitivity.share
+        if not record.windows.size:
+            continue
+        starts = objective.space.starts(chromosomes, k, record.initial_state(simulator.model))
+        beyond = simulator.beyond_parabolas(vectors, record, starts=starts)[0]
+        outputs = record.outputs - np.where(np.isfinite(beyond), beyond, 0.0)
+        moved = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
+        change += moved * sensitivity.share
     yield change
 
 

@@ -20,7 +20,10 @@ from sysid import (
 )
 from sysid.engine.filter_kernel import FilterKernel
 from sysid.examples import lag
-from sysid.fitting.means import as_parabolas, each_mean_once, scatter
+from sysid.fitting.innovations import Innovations
+from sysid.fitting.means import each_mean_once, scatter
+from sysid.fitting.objective import Objective
+from sysid.problem.space import SearchSpace
 
 DT, TAU = 1e-3, 0.05
 N = 300
@@ -202,7 +205,7 @@ def test_windows_that_fit_no_outputs_are_refused(windows, problem):
         Dataset(np.ones(5), np.zeros(5), DT, windows=windows)
 
 
-def test_a_mean_as_if_of_a_parabola_is_off_by_what_a_cubic_has_beside_it():
+def test_a_mean_tells_what_a_cubic_has_beside_a_parabola():
     """Behind a step of the jerk the output is u s^3 / 6, a parabola (3 s^2 - s) u / 12."""
     model = ProcessModel(
         name="jerk",
@@ -214,12 +217,32 @@ def test_a_mean_as_if_of_a_parabola_is_off_by_what_a_cubic_has_beside_it():
     )
     begin, end = -0.3, -0.1
     windows = np.tile([begin, end], (4, 1, 1))
+    windows[2] = -0.3  # an instant
     record = Dataset(np.full(4, 6.0), np.zeros(4), 1.0, windows=windows)
-    otherwise = as_parabolas(BatchSimulator(model), record, np.ones(1), np.zeros(3))
+    beyond = BatchSimulator(model).beyond_parabolas(np.ones(1), record)[0, :, 0]
     a, b = 1.0 + begin, 1.0 + end
     cubic = (b**4 - a**4) / 4.0
     parabola = (b**3 - a**3) / 2.0 - (b**2 - a**2) / 4.0
     # The part of a cubic that is none is the same in every sample.
-    np.testing.assert_allclose(
-        otherwise.outputs[1:, 0], np.full(3, (parabola - cubic) / (b - a)), rtol=1e-2
-    )
+    np.testing.assert_allclose(beyond[[1, 3]], np.full(2, (cubic - parabola) / (b - a)), rtol=1e-2)
+    assert beyond[2] == pytest.approx(a**3 - (1.5 * a**2 - 0.5 * a), rel=1e-2)
+
+
+@pytest.mark.parametrize(("noise", "exact"), [(1e-3, True), (0.5, False)])
+def test_a_filter_takes_no_parabolas_where_noise_does_not_cover_what_they_miss(noise, exact):
+    """Of a lag five times faster than the samples: its response to a held input is closed."""
+    rng, tau, n = np.random.default_rng(0), 0.2 * DT, 80
+    u, windows = rng.choice([-1.0, 1.0], n), np.sort(rng.uniform(-DT, 0.0, (n, 1, 2)), axis=2)
+    y, means = 0.0, np.zeros(n)
+    for k in range(1, n):
+        begin, end = windows[k, 0] + DT
+        fading = tau * (np.exp(-begin / tau) - np.exp(-end / tau)) / (end - begin)
+        means[k] = u[k - 1] + (y - u[k - 1]) * fading
+        y = u[k - 1] + (y - u[k - 1]) * np.exp(-DT / tau)
+    record = Dataset(u, means, DT, input_noise=np.array([1e-9]), windows=windows)
+    model, p = lag().with_initial({"y": 0.0}), np.array([1.0, tau])
+    objective = Objective(BatchSimulator(model), SearchSpace.of(model), [record])
+    fitted = Innovations.of(objective, np.array([noise]), corrects=True).eased(p)
+    assert fitted.exact == exact
+    left = fitted.residuals(p[None], np.array([4])).values[1:, 0, 0] * objective.scales[0]
+    assert (np.abs(left).max() < 0.01) == exact
