@@ -145,10 +145,10 @@ class Innovations(Objective):
         if not self.corrects:
             return self
         eased = self._with(coarseness=1, exact=False)
-        told = eased._in_noise(chromosome)
+        innovations = eased._in_noise(chromosome)
         for coarseness in _COARSER:
             coarser = eased._with(coarseness=coarseness)
-            if np.linalg.norm(coarser._in_noise(chromosome) - told) < moving:
+            if np.linalg.norm(coarser._in_noise(chromosome) - innovations) < moving:
                 eased = coarser
                 break
         exact = eased._with(exact=True)
