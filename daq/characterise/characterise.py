@@ -168,8 +168,8 @@ def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> C
         _run(current, done, watch)
         _identify([*done, current], request, watch)
         done.append(current)
-        write_page(root, done, "still running")
         reason = _end(request, done)
+        write_page(root, done, reason)
     last, report = done[-1], root / "report" / "report.html"
     if "missing" not in last.result or not report.exists():
         _identify(done, request, watch, ends=True)

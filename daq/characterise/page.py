@@ -22,7 +22,8 @@ _PAGE, _DATA = "characterise.html", "rounds.json"
 def write_page(root: Path, rounds: Sequence[Round], reason: str) -> Path:
     """Write the page, its figure and its numbers; the page's path.
 
-    reason: why there are no more rounds. Raises RunError where the disk refuses.
+    reason: why there are no more rounds; empty where there are. Raises RunError where the disk
+    refuses.
     """
     histories = [each.intervals() for each in rounds]
     seconds = np.cumsum([each.seconds for each in rounds])

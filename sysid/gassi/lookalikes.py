@@ -5,6 +5,11 @@ exp((-s +- jw) dt), and so do modes of w + 2 pi k / dt and of 2 pi k / dt - w. A
 faster than half the sample rate therefore has one minimum for each k, far apart in its parameters.
 And in itself: the mode of a driver and of what it drives stays as it is when their time constants
 swap roles. Such starts for descents follow from the eigenvalues of the linearised model.
+
+Where a model's states come to an end of a range, such as an amplifier's supply, outputs tell what
+they do not tell elsewhere. At parameters with which that end is just not reached, or just is, the
+error has a kink, on which noise makes a minimum of its own: what is better beyond it is found along
+the directions that a model without ends leaves undetermined.
 """
 
 from __future__ import annotations
@@ -16,7 +21,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, ComplexArray, FloatArray
 from sysid.fitting.objective import Objective
-from sysid.gassi.responses import alike_responses
+from sysid.gassi.responses import alike_directions, alike_responses
 from sysid.response.linearization import linear_models
 
 _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could be mistaken
@@ -29,6 +34,8 @@ _TURNS = (-0.3, -0.15, 0.15, 0.3)  # by these parts of their ranges
 _DIFFERENCE = 1e-6
 _ACTING = 1e-4  # parameters that move the mode less than this part of what the strongest does
 _REACHED = 0.02  # part of the frequency by which the end may miss the alias
+_SCANNED = 8  # places along a direction that only ends of ranges tell
+_SAME = 1e-5  # part of the error by which places that are as good may differ
 
 
 def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
@@ -36,6 +43,7 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     fastest, dt = _Modes(objective, chromosome), objective.records[0].dt
     swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
     starts = _harmless(objective, chromosome, [*swapped, *alike])
+    starts += _beyond_ends(objective, chromosome)
     for modes in (fastest, *fastest.others(2.0 * np.pi * _FASTEST_SEEN / dt)):
         starts += [*_twins(modes), *_aliases(modes, dt)]
     return starts
@@ -54,6 +62,26 @@ def _harmless(
     errors, _ = objective.evaluate(np.where(admitted[:, None], rows, chromosome))
     kept = admitted & (errors < _HARM * errors[0])
     return list(rows[1:][kept[1:]])
+
+
+def _beyond_ends(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
+    """The best along each direction that the linearised model does not show, where it is better.
+
+    Of places that are as good the middle one.
+    """
+    space, starts = objective.space, []
+    at, bounds = space.encode(chromosome), np.array(space.coded_bounds)
+    for direction in alike_directions(objective, chromosome):
+        moving = direction != 0.0
+        ends = np.sort((bounds - at)[:, moving] / direction[moving], axis=0)
+        places = np.linspace(ends[0].max(), ends[1].min(), _SCANNED)
+        rows = space.decode(np.clip(at + places[:, None] * direction, *bounds))
+        errors, _ = objective.evaluate(np.stack([chromosome, *rows]))
+        best = errors[1:].min()
+        if best < (1.0 - _SAME) * errors[0]:
+            as_good = np.flatnonzero(errors[1:] <= (1.0 + _SAME) * best)
+            starts.append(rows[as_good[len(as_good) // 2]])
+    return starts
 
 
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:

@@ -43,6 +43,15 @@ def alike_responses(objective: Objective, chromosome: FloatArray) -> list[FloatA
     return [responses.space.decode(end) for end in kept[1:]]
 
 
+def alike_directions(objective: Objective, chromosome: FloatArray) -> FloatArray:
+    """Directions of the search coordinates, (k, n_free), along which inputs are answered alike.
+
+    Those of parameters that each by itself changes the answers. Where an end of a range acts, such
+    as an amplifier's, which the linearised model does not know, the outputs show them.
+    """
+    return _Responses(objective, chromosome).tied()
+
+
 class _Responses:
     """Frequency responses of the model linearised at the first record's start.
 
@@ -79,6 +88,20 @@ class _Responses:
             direction = slopes[:, best] / sizes[best]
             slopes = slopes - np.outer(direction, direction @ slopes)
         return np.array(chosen, dtype=np.int64)
+
+    def tied(self) -> FloatArray:
+        """Directions that leave the response alone, (k, n_free), of parameters that move it."""
+        free, count = self.independent(), len(self.start)
+        if not len(free):
+            return np.zeros((0, count))
+        slopes = self._slopes(self.start[None], np.arange(count))[0]
+        sizes = np.linalg.norm(slopes, axis=0)
+        moving = np.flatnonzero(sizes > _ROUNDING * sizes.max(initial=0.0))
+        others = np.setdiff1d(moving, free)
+        directions = np.eye(count)[others]
+        directions[:, free] = -np.linalg.lstsq(slopes[:, free], slopes[:, others])[0].T
+        directions[np.abs(directions) < _ROUNDING] = 0.0
+        return directions * self.width
 
     def nearest(self, free: IntArray) -> tuple[FloatArray, FloatArray]:
         """Coordinates (n, n_free) whose responses come nearest, and by how much they miss, (n,)."""

@@ -47,6 +47,7 @@ def test_it_uses_the_time_and_tells_the_parameters(finished):
     widths = {q["name"]: q["width"] for q in document["quantities"]}
     assert widths.keys() == {"R_m", "K_m", "B_m"}
     page = (folder / "c" / "characterise.html").read_text()
+    assert "the 1.5 s are used up" in page and document["verdict"]["parameters"]["trust"] in page
     for quantity in document["quantities"]:
         assert f'data-value="{quantity["value"]!r}"' in page
     assert (folder / "c" / "report" / "report.html").exists()

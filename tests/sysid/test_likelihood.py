@@ -181,6 +181,31 @@ def test_lags_change_places_through_parameters_of_unlike_units():
     assert any(start == pytest.approx(exchanged, rel=1e-2) for start in starts)
 
 
+@pytest.mark.parametrize(("true", "stuck"), [(0.6, 1.02), (2.0, 0.7)], ids=["inside", "cut off"])
+def test_ends_of_a_range_are_looked_beyond(true, stuck):
+    """Where the amplifier ends at 1 V tells a scale of gain, R and L that nothing else does."""
+    nominal = true * np.array([1.0, 1.0, 0.05])
+    model = ProcessModel(
+        name="coil",
+        states=(State("current", "A"),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("current", "A"),),
+        parameters=tuple(
+            Parameter(name, unit, value, value / 10.0, 10.0 * value, "log")
+            for name, unit, value in zip(
+                ("gain", "R", "L"), ("V", "ohm", "H"), nominal, strict=True
+            )
+        ),
+        derivative=lambda x, u, p: ((min(max(p[0] * u[0], -1.0), 1.0) - p[1] * x[0]) / p[2],),
+    )
+    target = objective_of(model, record_of(model, 0.01))
+    here = nominal * stuck / true
+    starts = np.array(lookalikes(target, here))
+    scales = starts / here
+    (start,) = starts[np.ptp(scales, axis=1) < 1e-3 * scales[:, 0]]
+    assert target.evaluate(start[None])[0] < 0.8 * target.evaluate(here[None])[0]
+
+
 @pytest.mark.soak
 def test_lags_that_may_change_places_have_an_interval_for_each_answer():
     record = record_of(lags(), 0.01, noise=0.02)
