@@ -40,8 +40,8 @@ class PlantBench:
     of its range, would lead its parameters astray, and is refused as well. timed: whether the
     rig's speed is one count over the time between edges, whose instants err; a run in which the
     shaft turns round every few samples is refused then. identified: whether the draws are those of
-    an identification: then none that is compared may lead the model astray. strays: runs that were
-    refused since the plant does what the model does not.
+    an identification: then none that is compared may lead the model astray. strays, turning: runs
+    that were refused since the plant does what the model does not, or since the shaft turns round.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class PlantBench:
             )
         self._model, self._rig, self._turns = model, rig, turns
         self._timed = timed and SPEED in model.output_names
-        self._identified, self.strays = identified, 0
+        self._identified, self.strays, self.turning = identified, 0, 0
         self._scale = 1.0 / (1.0 - margin)
         self._simulator = BatchSimulator(plant, accuracy=_ACCURACY, threads=1)
         self._model_simulator = BatchSimulator(model, accuracy=_ACCURACY, threads=1)
@@ -97,6 +97,9 @@ class PlantBench:
             return None
         # What refuses most is computed first.
         steps, larger = self._finer(inputs, dt, vectors)
+        if not self._tells_speed(larger["omega"][0]):
+            self.turning += 1
+            return None
         if self._leads_astray(inputs, dt, vectors[0], larger, int(steps[0])):
             self.strays += 1
             return None

@@ -102,7 +102,7 @@ def choose(setup: Setup, watch: Watch = ignore) -> Design:
         )
     except ModelError as error:
         key = ("targets",) if setup.targets else ("protocols",)
-        raise setup.file.error(key, f"{error}{_strays(setup)}") from None
+        raise setup.file.error(key, f"{error}{_refusals(setup)}") from None
     if chosen.phantoms:
         problem = "the simulation's error would pass for information"
         cure = "a lower accuracy, such as 1e-4 in --config, makes it less"
@@ -110,15 +110,21 @@ def choose(setup: Setup, watch: Watch = ignore) -> Design:
     return chosen
 
 
-def _strays(setup: Setup) -> str:
-    """How many runs were refused for the model's sake, and the cure; empty for none."""
-    count = setup.bench.strays
-    if not count:
-        return ""
-    return (
-        f" (in {count} runs the plant did what model {setup.problem.model_name} does not: name one "
-        "that is like the plant, as --model actuator:hysteresis=dahl for a rig of that kind)"
-    )
+def _refusals(setup: Setup) -> str:
+    """How many runs were refused for no limit, and the cures; empty for none."""
+    text, bench = "", setup.bench
+    if bench.turning:
+        text += (
+            f" (in {bench.turning} runs the shaft turned round too often for an encoder whose "
+            "edges make the speed: other protocols, or more turns of a cable, may keep it turning)"
+        )
+    if bench.strays:
+        text += (
+            f" (in {bench.strays} runs the plant did what model {setup.problem.model_name} does "
+            "not: name one that is like the plant, as --model actuator:hysteresis=dahl for a rig "
+            "of that kind)"
+        )
+    return text
 
 
 def write(setup: Setup, chosen: Design, folder: Path) -> DesignResult:

@@ -129,6 +129,7 @@ def test_a_shaft_that_turns_round_every_few_samples_tells_edges_no_speed(frequen
         careful = PlantBench(model, device.plant_model(5.0), config, 5.0, 0.1, noise, timed)
         records = careful.records(shaken, 1.0 / 800.0, model.nominal[None])
         assert (records is not None) == (passes or not timed)
+        assert (careful.turning, careful.strays) == (timed and not passes, 0)
 
 
 def test_the_instants_of_edges_err_as_a_log_shows(tmp_path):
