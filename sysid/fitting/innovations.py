@@ -54,11 +54,13 @@ _SHOWING = 0.025  # part of an output's peak that inputs' averages may take from
 _DRAWS, _BENT = 8, 0.1
 # Integration steps of a free run that one of a filter may stand for, and by how many deviations of
 # any quantity the difference may move it where an answer is at stake.
-_COARSER, _MOVING = (3, 2), 0.2
+_COARSER, _MOVING = (3.0, 2.0, 1.0, 0.5, 0.25), 0.2
 # Deviations by which parabolas for averaged outputs may move any quantity: intervals count it. And
 # changes of search coordinates, in parts of their ranges, that tell slopes in spite of small kinks.
 _OFF, _MOVE = 1.5, 1e-3
 _FEWEST = 2  # a sample, where a free run takes more
+_MANY = 32  # a sample, with which no covariance bursts
+_BURST = 0.1  # of the innovations, by which steps of a free run may change them
 
 
 class Innovations(Objective):
@@ -70,7 +72,8 @@ class Innovations(Objective):
     over the root of a second. scatter: per record, (n_samples, n_outputs), variances of single
     samples beside the noise, by the jitter of their windows. Where it corrects, the records have
     each mean over a window once. coarseness: integration steps of a free run that one of the
-    filter's stands for. exact: whether averages are not of parabolas between samples.
+    filter's stands for; least: of the filter's in a sample. exact: whether averages are not of
+    parabolas between samples.
     """
 
     noise: FloatArray
@@ -80,7 +83,8 @@ class Innovations(Objective):
     process: FloatArray
     colour: list[FloatArray]
     quiet: bool
-    coarseness: int
+    coarseness: float
+    least: int
     exact: bool
 
     @classmethod
@@ -110,7 +114,8 @@ class Innovations(Objective):
             variant.records, variant.colour = [q.record for q in parts], [q.colour for q in parts]
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.scatter = [scatter(record) for record in variant.records]
-        variant.corrects, variant.coarseness, variant.exact = corrects, 1, False
+        variant.corrects, variant.exact = corrects, False
+        variant.coarseness, variant.least = 1.0, 1
         n_states = len(objective.simulator.model.states)
         variant.process = np.zeros(n_states) if process is None else process
         return variant
@@ -132,6 +137,8 @@ class Innovations(Objective):
         variant = cls.of(
             objective, error, corrects=corrects, process=process, quiet=quiet, near=chromosome
         )
+        if corrects:
+            variant = variant._with_fewest_steps(chromosome, _MOVING)
         return variant.settled(chromosome).eased(chromosome)
 
     def eased(self, chromosome: FloatArray, moving: float = _MOVING) -> Self:
@@ -144,16 +151,29 @@ class Innovations(Objective):
         """
         if not self.corrects:
             return self
-        eased = self._with(coarseness=1, exact=False)
-        innovations = eased._in_noise(chromosome)
-        for coarseness in _COARSER:
-            coarser = eased._with(coarseness=coarseness)
-            if np.linalg.norm(coarser._in_noise(chromosome) - innovations) < moving:
-                eased = coarser
-                break
+        eased = self._with(exact=False)._with_fewest_steps(chromosome, moving)
         exact = eased._with(exact=True)
         missed = exact._in_noise(chromosome) - eased._in_noise(chromosome)
         return eased if eased._moved_by(missed, chromosome) < _OFF else exact
+
+    def _with_fewest_steps(self, chromosome: FloatArray, moving: float) -> Self:
+        exact = self.uneased._in_noise(chromosome)
+        for coarseness in _COARSER:
+            coarser = self._with(coarseness=coarseness, least=1)
+            error = np.linalg.norm(coarser._in_noise(chromosome) - exact)
+            burst = not error < _BURST * np.linalg.norm(exact)
+            if error < moving or (coarseness <= 1.0 and not burst):
+                return coarser
+        return self.uneased
+
+    @property
+    def uneased(self) -> Self:
+        """With the most integration steps, for chromosomes far from that of ``eased``.
+
+        A free run may hardly move a fast mode that noise moves. Where its steps are too few for
+        that, covariances burst, and innovations divided by them are next to nothing.
+        """
+        return self._with(coarseness=1.0, least=_MANY)
 
     def _moved_by(self, change: FloatArray, chromosome: FloatArray) -> float:
         """Deviations that a change of the innovations moves any quantity by, at most.
@@ -192,7 +212,8 @@ class Innovations(Objective):
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """As ``Objective.steps_needed``, of which a filter that corrects needs a part."""
         steps = super().steps_needed(chromosomes)
-        return np.maximum(steps // self.coarseness, np.minimum(steps, _FEWEST))
+        part = (steps / self.coarseness).astype(steps.dtype)
+        return np.maximum(np.maximum(part, self.least), np.minimum(steps, _FEWEST))
 
     def _reacting(self, chromosome: FloatArray) -> list[Dataset]:
         """The records with what their inputs do between samples."""

@@ -186,7 +186,7 @@ class _Optima:
     def refit(self, optimum: Optimum, refitted: Optimum | None) -> None:
         """Put one fitted by its own noise, if it could be, in the place of a minimum."""
         if refitted is not None:
-            rms = optimum.objective.rms(refitted.chromosome[None])[0]
+            rms = _exactly(optimum.objective).rms(refitted.chromosome[None])[0]
             place = [kept is optimum for kept in self._optima].index(True)
             self._optima[place] = _optimum(refitted.objective, refitted.chromosome, rms)
 
@@ -386,11 +386,15 @@ def _refitted(
         ends = _conceivable(first.objective, starts, optima, best)
         descents = [begin(first.objective, end.chromosome) for end in ends]
         for end in refine_each(first.objective, descents):
-            optima.add(_optimum(first.objective, end.chromosome, end.rms))
+            rms = _exactly(first.objective).rms(end.chromosome[None])[0]
+            optima.add(_optimum(first.objective, end.chromosome, rms))
         (best, *others), starts = optima.ranked(), []
         if filters and optima.deviance(first, best) > _TOLD_APART:
             anew = fit(replace(best, objective=ranked[0].objective), watch)
-            if anew is not None:
+            if anew is None or not _foresees_more(anew, first):
+                optima.refit(best, anew)
+                best = optima.ranked()[0]
+            else:
                 near = (o for o in others if optima.deviance(o, best) < _CONCEIVABLE)
                 starts = [optimum.chromosome for optimum in near]
                 optima, best = _Optima.around(anew, objective, too_well), anew
@@ -398,6 +402,11 @@ def _refitted(
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
+
+
+def _exactly(objective: Objective) -> Objective:
+    """By which minima far from one another are compared."""
+    return objective.uneased if isinstance(objective, Innovations) else objective
 
 
 def _conceivable(
@@ -524,7 +533,7 @@ def _foresees_more(optimum: Optimum, rival: Optimum) -> bool:
     assert isinstance(fitted, Innovations) and isinstance(before, Innovations)
     if optimum.feasible != rival.feasible:
         return optimum.feasible
-    common = fitted.of_noise(np.minimum(fitted.noise, before.noise))
+    common = fitted.of_noise(np.minimum(fitted.noise, before.noise)).uneased
     rms = common.rms(np.stack([optimum.chromosome, rival.chromosome]))
     loss = np.log(np.maximum(rms, _TINY)) @ (fitted.counts * (fitted.weights > 0.0))
     return bool(loss[0] < loss[1])

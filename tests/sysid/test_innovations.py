@@ -360,6 +360,37 @@ def test_a_filter_takes_fewer_steps_where_noise_covers_what_they_miss(noise, coa
     assert np.linalg.norm((coarse - fine) * objective.scales[0] / noise) < 0.2
 
 
+@pytest.mark.soak
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_filter_takes_the_steps_of_modes_that_only_noise_moves(smooth):
+    """A free run of a slow command does not need them; with few the covariance bursts."""
+    rng, n, dt, noise = np.random.default_rng(2), 400, 1.25e-3, 0.005
+    model = ProcessModel(
+        "coil at an amplifier that ends",
+        (State("voltage", "V", first_sample=False), State("current", "A")),
+        (Input("asked", "A"),),
+        (Output("current", "A"),),
+        tuple(
+            Parameter(name, "1", value, 0.1 * value, 10.0 * value, "log")
+            for name, value in (("K", 100.0), ("w", 660.0), ("R", 1.2), ("L", 8.6e-4))
+        ),
+        lambda x, u, p: (
+            p[1] * (p[0] * (u[0] - x[1]) - x[0]),
+            (min(max(x[0], -24.0), 24.0) - p[2] * x[1]) / p[3],
+        ),
+    )
+    asked = np.sin(30.0 * dt * np.arange(n)) if smooth else prbs(rng, n, -1.0, 1.0)
+    record = Dataset(asked, np.zeros((n, 1)), dt, input_noise=np.array([noise]))
+    exact = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal[None], record)[0]
+    record = replace(record, outputs=exact + noise * rng.standard_normal(exact.shape))
+    objective = Objective(BatchSimulator(model), SearchSpace.of(model), [record])
+    fitted = Innovations.of(objective, np.array([noise]), corrects=True).eased(model.nominal)
+    faster = model.nominal * np.array([1.0, 1.0, 0.23, 0.23])
+    for by, chromosome in ((fitted, model.nominal), (fitted.uneased, faster)):
+        values = by.residuals(chromosome[None], [128]).values
+        assert by.rms(chromosome[None])[0] == pytest.approx(np.sqrt(np.mean(values**2)), rel=0.1)
+
+
 def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
     *_, record = list(noisy_records(2, of_output=0.01))[:3]
     fit = GASSI(lag(), population=20, generations=8).fit(record)
