@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -47,8 +47,12 @@ _FARTHEST = 2.3  # change of its logarithm that two rounds may foretell
 _LEAST_NOISE, _NEAR = 1e-2, 0.1
 _LEAST_OF_FILTER = 1e-4
 _TENTH = 0.1
+_BY_CHANCE = 3.0  # deviations
+_OF_THIRDS = 20.0  # variance of third differences of white noise of variance one
 _TINY = 1e-300
+_LEFT = 0.5  # part of an input's noise that averages may leave: with more they cure nothing
 _SHOWING = 0.025  # part of an output's peak that inputs' averages may take from it
+MISJUDGED = 0.02  # share of an output's innovations, above which a filter is no judge
 # Draws of the inputs' noise that show where equations bend under it, and parts of an innovation's
 # deviation from which they do.
 _DRAWS, _BENT = 8, 0.1
@@ -133,13 +137,19 @@ class Innovations(Objective):
         steps = objective.steps_needed(chromosome[None])[0]
         residual = objective.residuals(chromosome[None], steps).values[..., 0]
         error = objective.in_units(residual)
-        quiet = corrects and _may_average(objective, chromosome, steps, residual)
-        variant = cls.of(
-            objective, error, corrects=corrects, process=process, quiet=quiet, near=chromosome
-        )
-        if corrects:
-            variant = variant._with_fewest_steps(chromosome, _MOVING)
-        return variant.settled(chromosome).eased(chromosome)
+        settings: dict[str, Any] = {"corrects": corrects, "process": process, "near": chromosome}
+        plain = cls.of(objective, error, **settings)._noise_found(chromosome)
+        # A filter is best told all; what averages lose of the inputs repeats itself.
+        misled = corrects and bool(np.any(plain.bent(chromosome) > MISJUDGED))
+        if misled and _may_average(objective, chromosome, steps, residual):
+            averaged = cls.of(objective, error, quiet=True, **settings)
+            return averaged._noise_found(chromosome).eased(chromosome)
+        return plain.eased(chromosome)
+
+    def _noise_found(self, chromosome: FloatArray) -> Self:
+        """With the noise that comes of few integration steps at a chromosome, (n_free,)."""
+        few = self._with_fewest_steps(chromosome, _MOVING) if self.corrects else self
+        return few.settled(chromosome)
 
     def eased(self, chromosome: FloatArray, moving: float = _MOVING) -> Self:
         """With as little effort as tells the same at a chromosome, (n_free,).
@@ -243,7 +253,23 @@ class Innovations(Objective):
             settled = settled.of_noise(noise)
             if np.abs(change).max() < _STEADY:
                 break
-        return settled
+        return settled._as_shown(chromosome, least) if self.corrects else settled
+
+    def _as_shown(self, chromosome: FloatArray, least: FloatArray) -> Self:
+        """With no more noise of an output than its samples show by themselves, (n_outputs,).
+
+        Innovations hardly tell it where noise of the inputs does nearly all of them; where they
+        contradict, something else is in them.
+        """
+        shown = np.maximum(self.shown_noise, least)
+        if not np.any(self.noise > shown):
+            return self
+        quieter = self.of_noise(np.minimum(self.noise, shown))
+        steps = self.steps_needed(chromosome[None])
+        innovations = quieter._simulated(chromosome[None], steps, balanced=False).values[..., 0]
+        squares = (self.in_units(innovations) / quieter.noise) ** 2
+        believed = squares < 1.0 + _BY_CHANCE * np.sqrt(2.0 / np.maximum(self.counts, 1))
+        return self.of_noise(np.where(believed, quieter.noise, self.noise))
 
     def of_noise(self, noise: FloatArray) -> Self:
         """With other noise of the outputs, (n_outputs,)."""
@@ -276,6 +302,14 @@ class Innovations(Objective):
         for j in np.flatnonzero(seen.any(axis=0)):
             least[j] = np.sqrt(np.quantile(scatter[seen[:, j], j], _TENTH))
         return least
+
+    @property
+    def shown_noise(self) -> FloatArray:
+        """Deviation of white noise that the outputs' samples show at most, (n_outputs,)."""
+        thirds = np.concatenate([np.diff(record.outputs, 3, axis=0) for record in self.records])
+        counts = np.isfinite(thirds).sum(axis=0)
+        squares = np.nansum(thirds**2, axis=0) / np.maximum(counts, 1) / _OF_THIRDS
+        return np.sqrt(np.where(counts > 0, squares, np.inf))
 
     @property
     def free_run(self) -> Objective:
@@ -367,11 +401,14 @@ class Innovations(Objective):
 def _may_average(
     objective: Objective, chromosome: FloatArray, steps: IntArray, residual: FloatArray
 ) -> bool:
-    """Whether what averaged inputs lose is too little to show in the outputs of a free run.
+    """Whether averages take most of the inputs' noise, and of the free run's outputs next to none.
 
     residual: that of the inputs as they are, (n_residuals, n_outputs).
     """
     parts = [denoised(record) for record in objective.records]
+    pairs = zip(parts, objective.records, strict=True)
+    if not all(np.any(part.record.input_noise < _LEFT * r.input_noise) for part, r in pairs):
+        return False
     lost = max(float(part.lost.max(initial=0.0)) for part in parts)
     averaged = objective.on([part.record for part in parts])
     moved = averaged.residuals(chromosome[None], steps).values[..., 0] - residual

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.innovations import MISJUDGED
 from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.residual_patterns import errors_alone, errors_by_speed, shared_errors
@@ -50,7 +51,6 @@ _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
 # Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
 # output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
-_BENT = 0.02  # share of innovations that a filter misjudges
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
 
@@ -485,7 +485,7 @@ def _corrected(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
 
 def _bent_filter(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
     """Reason: a filter that takes for straight what is bent within noise."""
-    if np.any(uncertainty.bent > _BENT):
+    if np.any(uncertainty.bent > MISJUDGED):
         j = int(np.argmax(uncertainty.bent))
         yield (
             f"The noise of the inputs hides where the equations bend (in {uncertainty.bent[j]:.0%} "

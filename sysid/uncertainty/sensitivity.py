@@ -237,7 +237,8 @@ def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]
         # As weights follow the errors.
         sizes = np.sum(residual**2, axis=0) / np.maximum(np.sum(moved.residual**2, axis=0), _TINY)
         onward = np.einsum("tip,ti,i->p", moved.slopes, moved.residual, weight * sizes)
-        raises = deviation / fall
+        # It is between nothing and what the output's samples show.
+        raises = min(deviation / fall, float(fitted.shown_noise[j] / fitted.noise[j]) ** 2)
         yield (onward - score) * raises * _of_positive(1.0 / (raises * raised))
 
 
