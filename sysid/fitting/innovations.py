@@ -63,6 +63,7 @@ _COARSER, _MOVING = (3.0, 2.0, 1.0, 0.5, 0.25), 0.2
 # changes of search coordinates, in parts of their ranges, that tell slopes in spite of small kinks.
 _OFF, _MOVE = 1.5, 1e-3
 _FEWEST = 2  # a sample, where a free run takes more
+_PART = 0.5  # of a deviation that steps of a free run may move any quantity by
 _MANY = 32  # a sample, with which no covariance bursts
 _BURST = 0.1  # of the innovations, by which steps of a free run may change them
 
@@ -170,9 +171,13 @@ class Innovations(Objective):
         exact = self.uneased._in_noise(chromosome)
         for coarseness in _COARSER:
             coarser = self._with(coarseness=coarseness, least=1)
-            error = np.linalg.norm(coarser._in_noise(chromosome) - exact)
-            burst = not error < _BURST * np.linalg.norm(exact)
-            if error < moving or (coarseness <= 1.0 and not burst):
+            error = coarser._in_noise(chromosome) - exact
+            size = np.linalg.norm(error)
+            burst = not size < _BURST * np.linalg.norm(exact)
+            if size < moving:
+                return coarser
+            # Most of it moves nothing, which takes a simulation for each parameter to know.
+            if coarseness <= 1.0 and not burst and coarser._moved_by(error, chromosome) < _PART:
                 return coarser
         return self.uneased
 
