@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import comb
 from typing import Any, Self
 
 import numpy as np
@@ -48,7 +49,8 @@ _LEAST_NOISE, _NEAR = 1e-2, 0.1
 _LEAST_OF_FILTER = 1e-4
 _TENTH = 0.1
 _BY_CHANCE = 3.0  # deviations
-_OF_THIRDS = 20.0  # variance of third differences of white noise of variance one
+_WHITE = 1.05  # ratio of what third and fifth differences show, below which it is white noise
+_MEDIAN = 0.6745  # of the size of a normal variable of unit deviation
 _TINY = 1e-300
 _LEFT = 0.5  # part of an input's noise that averages may leave: with more they cure nothing
 _SHOWING = 0.025  # part of an output's peak that inputs' averages may take from it
@@ -261,20 +263,21 @@ class Innovations(Objective):
         return settled._as_shown(chromosome, least) if self.corrects else settled
 
     def _as_shown(self, chromosome: FloatArray, least: FloatArray) -> Self:
-        """With no more noise of an output than its samples show by themselves, (n_outputs,).
+        """With the noise of outputs that their samples show, where innovations do not contradict.
 
-        Innovations hardly tell it where noise of the inputs does nearly all of them; where they
-        contradict, something else is in them.
+        These hardly tell it where noise of the inputs does nearly all of them.
         """
-        shown = np.maximum(self.shown_noise, least)
-        if not np.any(self.noise > shown):
+        shown, is_white = self.shown_noise
+        wanted = np.where(is_white, shown, np.minimum(self.noise, shown))
+        wanted = np.maximum(wanted, least)
+        if np.all(wanted == self.noise):
             return self
-        quieter = self.of_noise(np.minimum(self.noise, shown))
+        other = self.of_noise(wanted)
         steps = self.steps_needed(chromosome[None])
-        innovations = quieter._simulated(chromosome[None], steps, balanced=False).values[..., 0]
-        squares = (self.in_units(innovations) / quieter.noise) ** 2
-        believed = squares < 1.0 + _BY_CHANCE * np.sqrt(2.0 / np.maximum(self.counts, 1))
-        return self.of_noise(np.where(believed, quieter.noise, self.noise))
+        innovations = other._simulated(chromosome[None], steps, balanced=False).values[..., 0]
+        squares = (self.in_units(innovations) / wanted) ** 2
+        by_chance = _BY_CHANCE * np.sqrt(2.0 / np.maximum(self.counts, 1))
+        return self.of_noise(np.where(np.abs(squares - 1.0) < by_chance, wanted, self.noise))
 
     def of_noise(self, noise: FloatArray) -> Self:
         """With other noise of the outputs, (n_outputs,)."""
@@ -309,12 +312,30 @@ class Innovations(Objective):
         return least
 
     @property
-    def shown_noise(self) -> FloatArray:
-        """Deviation of white noise that the outputs' samples show at most, (n_outputs,)."""
-        thirds = np.concatenate([np.diff(record.outputs, 3, axis=0) for record in self.records])
-        counts = np.isfinite(thirds).sum(axis=0)
-        squares = np.nansum(thirds**2, axis=0) / np.maximum(counts, 1) / _OF_THIRDS
-        return np.sqrt(np.where(counts > 0, squares, np.inf))
+    def shown_noise(self) -> tuple[FloatArray, BoolArray]:
+        """Deviation of white noise that the outputs' samples show at most, (n_outputs,).
+
+        And whether it is that: where nothing smooth is left in differences of samples, those of
+        any order have their part of it, most of the time. Not of means over windows, nor where the
+        process has noise.
+        """
+        most, typical = zip(*(self._of_differences(order) for order in (3, 5)), strict=True)
+        rough = np.any(np.concatenate(self.scatter) > 0.0, axis=0) | bool(self.process.any())
+        is_white = (typical[1] > 0.0) & (typical[0] < _WHITE * typical[1]) & ~rough
+        return np.where(is_white, typical[1], most[0]), is_white
+
+    def _of_differences(self, order: int) -> tuple[FloatArray, FloatArray]:
+        """Root mean square of the outputs' differences and most of them, in parts of white noise's.
+
+        (n_outputs,) each; infinite and zero where there are none.
+        """
+        tables = [np.diff(record.outputs, order, axis=0) for record in self.records]
+        differences = np.concatenate(tables) / np.sqrt(comb(2 * order, order))
+        some = np.isfinite(differences).any(axis=0)
+        root, typical = np.full(len(some), np.inf), np.zeros(len(some))
+        root[some] = np.sqrt(np.nanmean(differences[:, some] ** 2, axis=0))
+        typical[some] = np.nanmedian(np.abs(differences[:, some]), axis=0) / _MEDIAN
+        return root, typical
 
     @property
     def free_run(self) -> Objective:

@@ -22,6 +22,7 @@ _KINK = 0.01
 _DRAWS = 128
 # Shares by which the variance of an output's noise is raised until its innovations show it.
 _RAISED = 0.02 * 4.0 ** np.arange(12)
+_CHANCE_OF_SHOWN = 3.0  # deviations times the root of the samples of a variance by differences
 _TINY = 1e-300
 
 
@@ -52,6 +53,11 @@ class Sensitivity:
     def lengths(self) -> tuple[int, ...]:
         """Residuals of each record, which stand one after another."""
         return tuple(record.n_samples for record in self.objective.records)
+
+    @property
+    def corrects(self) -> bool:
+        """Whether the residuals are innovations of a filter that corrects itself."""
+        return isinstance(self.criterion, Innovations) and self.criterion.corrects
 
     @cached_property
     def rows(self) -> FloatArray:
@@ -237,8 +243,10 @@ def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]
         # As weights follow the errors.
         sizes = np.sum(residual**2, axis=0) / np.maximum(np.sum(moved.residual**2, axis=0), _TINY)
         onward = np.einsum("tip,ti,i->p", moved.slopes, moved.residual, weight * sizes)
-        # It is between nothing and what the output's samples show.
-        raises = min(deviation / fall, float(fitted.shown_noise[j] / fitted.noise[j]) ** 2)
+        # It is between nothing and what the output's samples show, or known by these.
+        shown, is_white = fitted.shown_noise
+        most = _CHANCE_OF_SHOWN / np.sqrt(fitted.counts[j]) if is_white[j] else 1.0
+        raises = min(deviation / fall, most * float(shown[j] / fitted.noise[j]) ** 2)
         yield (onward - score) * raises * _of_positive(1.0 / (raises * raised))
 
 

@@ -600,9 +600,30 @@ def test_little_noise_of_an_output_is_found_beside_what_that_of_an_input_does():
     noisy = u + OF_INPUT * rng.standard_normal(1500)
     record = Dataset(noisy, y, DT, input_noise=np.array([OF_INPUT]))
     objective = Objective(BatchSimulator(lag()), SearchSpace.of(lag()), [record])
+    at_truth = np.array([GAIN, TAU])
+    settled = Innovations.starting(objective, at_truth, corrects=True)
+    squares = settled.rms(at_truth[None])[0] * settled.scales[0] / settled.noise
+    assert squares**2 == pytest.approx(1.0, abs=3.0 * np.sqrt(2.0 / 1500))
+    assert truth < settled.noise < 2.0 * truth
+
+
+def test_noise_of_an_output_is_what_its_samples_show_where_innovations_hardly_tell_it():
+    """Of a smooth motion: what differences of the samples show is white, and the sensor's."""
+    rng, n = np.random.default_rng(5), 3000
+    u = 3.0 * np.sin(0.02 * np.arange(n)) + 2.0 * np.sin(0.11 * np.arange(n))
+    exact = np.concatenate([[0.0], lfilter([PART], [1.0, PART - 1.0], GAIN * u)[:-1]])
+    record = Dataset(
+        u + OF_INPUT * rng.standard_normal(n),
+        exact + 0.005 * rng.standard_normal(n),
+        DT,
+        input_noise=np.array([OF_INPUT]),
+    )
+    objective = Objective(BatchSimulator(lag()), SearchSpace.of(lag()), [record])
     settled = Innovations.starting(objective, np.array([GAIN, TAU]), corrects=True)
-    squares = settled.rms(np.array([[GAIN, TAU]]))[0] * settled.scales[0] / settled.noise
-    assert squares**2 == pytest.approx(1.0, abs=1e-3)
+    assert settled.noise == pytest.approx(0.005, rel=0.05)
+    # Of wrong parameters innovations contradict, and tell it themselves.
+    wrong = Innovations.starting(objective, np.array([0.5 * GAIN, TAU]), corrects=True)
+    assert wrong.noise > 0.05
 
 
 @pytest.mark.parametrize("answer", [-1.3, -1.0, -0.6, -0.2, 0.4])
