@@ -272,9 +272,9 @@ class Innovations(Objective):
         wanted = np.maximum(wanted, least)
         if np.all(wanted == self.noise):
             return self
-        other = self.of_noise(wanted)
+        as_shown = self.of_noise(wanted)
         steps = self.steps_needed(chromosome[None])
-        innovations = other._simulated(chromosome[None], steps, balanced=False).values[..., 0]
+        innovations = as_shown._simulated(chromosome[None], steps, balanced=False).values[..., 0]
         squares = (self.in_units(innovations) / wanted) ** 2
         by_chance = _BY_CHANCE * np.sqrt(2.0 / np.maximum(self.counts, 1))
         return self.of_noise(np.where(np.abs(squares - 1.0) < by_chance, wanted, self.noise))
@@ -331,10 +331,10 @@ class Innovations(Objective):
         """
         tables = [np.diff(record.outputs, order, axis=0) for record in self.records]
         differences = np.concatenate(tables) / np.sqrt(comb(2 * order, order))
-        some = np.isfinite(differences).any(axis=0)
-        root, typical = np.full(len(some), np.inf), np.zeros(len(some))
-        root[some] = np.sqrt(np.nanmean(differences[:, some] ** 2, axis=0))
-        typical[some] = np.nanmedian(np.abs(differences[:, some]), axis=0) / _MEDIAN
+        seen = np.isfinite(differences).any(axis=0)
+        root, typical = np.full(len(seen), np.inf), np.zeros(len(seen))
+        root[seen] = np.sqrt(np.nanmean(differences[:, seen] ** 2, axis=0))
+        typical[seen] = np.nanmedian(np.abs(differences[:, seen]), axis=0) / _MEDIAN
         return root, typical
 
     @property
