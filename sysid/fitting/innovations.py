@@ -173,15 +173,23 @@ class Innovations(Objective):
         exact = self.uneased._in_noise(chromosome)
         for coarseness in _COARSER:
             coarser = self._with(coarseness=coarseness, least=1)
-            error = coarser._in_noise(chromosome) - exact
-            size = np.linalg.norm(error)
-            burst = not size < _BURST * np.linalg.norm(exact)
-            if size < moving:
-                return coarser
-            # Most of it moves nothing, which takes a simulation for each parameter to know.
-            if coarseness <= 1.0 and not burst and coarser._moved_by(error, chromosome) < _PART:
+            error = np.linalg.norm(coarser._in_noise(chromosome) - exact)
+            burst = not error < _BURST * np.linalg.norm(exact)
+            if error < moving or (coarseness <= 1.0 and not burst):
                 return coarser
         return self.uneased
+
+    def exactly(self, chromosome: FloatArray) -> Self:
+        """With as many integration steps as an answer wants at a chromosome, (n_free,).
+
+        Those that a search goes by may move quantities by more than a part of their deviations.
+        """
+        exact, finer = self.uneased._in_noise(chromosome), self
+        for coarseness in [c for c in _COARSER if c < self.coarseness]:
+            if finer._moved_by(finer._in_noise(chromosome) - exact, chromosome) < _PART:
+                break
+            finer = self._with(coarseness=coarseness)
+        return finer
 
     @property
     def uneased(self) -> Self:

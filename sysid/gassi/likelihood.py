@@ -125,7 +125,20 @@ def fit_likelihood(
     apart = list(itertools.compress(rivals, np.logical_not(connected)))
     valley = itertools.compress(rivals, connected)
     ridge = [rival for rival in valley if optima.deviance(rival, best) < Z95**2]
-    return Likeliest(_slid(best), _chromosomes(apart), _chromosomes(ridge))
+    return Likeliest(_slid(_resting(best)), _chromosomes(apart), _chromosomes(ridge))
+
+
+def _resting(best: Optimum) -> Optimum:
+    """The minimum of a filter with as many steps as an answer wants."""
+    fitted = best.objective
+    if not (isinstance(fitted, Innovations) and fitted.corrects):
+        return best
+    finer = fitted.exactly(best.chromosome)
+    if finer.coarseness == fitted.coarseness:
+        return best
+    settled = finer.settled(best.chromosome)
+    end = refine(settled, best.chromosome)
+    return _optimum(settled, end.chromosome, end.rms)
 
 
 def promising(
