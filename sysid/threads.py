@@ -46,7 +46,15 @@ class Workers:
 
         # This thread is one of them: waking another takes as long as a short simulation.
         others = min(self.count, len(tasks)) - 1
-        workers = [self._ready().submit(work) for _ in range(others)]
+        try:
+            workers = [self._ready().submit(work) for _ in range(others)]
+        except BaseException:
+            # Ctrl-C: a thread that was just begun may not be known to the pool, which would then
+            # never be told to end, and the program would wait for it.
+            if self._pool is not None:
+                self._pool.shutdown(wait=False)
+                self._pool = None
+            raise
         try:
             work()
             for worker in workers:
