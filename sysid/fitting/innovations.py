@@ -143,8 +143,8 @@ class Innovations(Objective):
         settings: dict[str, Any] = {"corrects": corrects, "process": process, "near": chromosome}
         plain = cls.of(objective, error, **settings)._noise_found(chromosome)
         # A filter is best told all; what averages lose of the inputs repeats itself.
-        misled = corrects and bool(np.any(plain.bent(chromosome) > MISJUDGED))
-        if misled and _may_average(objective, chromosome, steps, residual):
+        may_average = corrects and _may_average(objective, chromosome, steps, residual)
+        if may_average and np.any(plain.bent(chromosome) > MISJUDGED):
             averaged = cls.of(objective, error, quiet=True, **settings)
             return averaged._noise_found(chromosome).eased(chromosome)
         return plain.eased(chromosome)
