@@ -39,6 +39,7 @@ from sysid.fitting.averages import coloured, denoised
 from sysid.fitting.means import each_mean_once, scatter
 from sysid.fitting.objective import Objective
 from sysid.fitting.reactions import with_reactions
+from sysid.problem.channels import MEDIAN_OF_NORMAL
 from sysid.problem.data import Dataset
 
 _ROUNDS, _STEADY = 30, 1e-4  # of the outputs' noise, and its relative change at the end
@@ -50,7 +51,6 @@ _LEAST_OF_FILTER = 1e-4
 _TENTH = 0.1
 _BY_CHANCE = 3.0  # deviations
 _WHITE = 1.05  # ratio of what third and fifth differences show, below which it is white noise
-_MEDIAN = 0.6745  # of the size of a normal variable of unit deviation
 _TINY = 1e-300
 _LEFT = 0.5  # part of an input's noise that averages may leave: with more they cure nothing
 _SHOWING = 0.025  # part of an output's peak that inputs' averages may take from it
@@ -342,7 +342,7 @@ class Innovations(Objective):
         seen = np.isfinite(differences).any(axis=0)
         root, typical = np.full(len(seen), np.inf), np.zeros(len(seen))
         root[seen] = np.sqrt(np.nanmean(differences[:, seen] ** 2, axis=0))
-        typical[seen] = np.nanmedian(np.abs(differences[:, seen]), axis=0) / _MEDIAN
+        typical[seen] = np.nanmedian(np.abs(differences[:, seen]), axis=0) / MEDIAN_OF_NORMAL
         return root, typical
 
     @property

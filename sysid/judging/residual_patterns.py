@@ -11,6 +11,7 @@ from scipy.special import bdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.residual_tests import residual_test
+from sysid.problem.channels import MEDIAN_OF_NORMAL
 from sysid.uncertainty.estimate import Z95
 
 _LAGS = 20  # at which two outputs' residuals are compared
@@ -20,7 +21,6 @@ _EXPECTED = 0.5  # of a residual's deviation, from where what a right model leav
 # Robust deviations from its neighbours at which an error stands alone, the share of such that does
 # little harm (Student's noise of four degrees of freedom has 0.3 %), and the chance of more.
 _ALONE, _HEAVY, _BY_CHANCE = 6.0, 1e-2, 1e-4
-_ROBUST = 0.6745  # median of |x| of a normal x of unit deviation
 
 
 def shared_errors(residual: FloatArray, systematic: FloatArray) -> FloatArray:
@@ -83,7 +83,7 @@ def errors_alone(residual: FloatArray) -> FloatArray:
     sizes = np.abs(np.where(np.isfinite(apart), apart, 0.0))
     for j in np.flatnonzero(sizes.any(axis=0)):
         size = sizes[:, j]
-        limit = _ALONE / _ROBUST * float(np.median(size[size > 0.0]))
+        limit = _ALONE / MEDIAN_OF_NORMAL * float(np.median(size[size > 0.0]))
         beside = np.maximum(np.roll(size, 1), np.roll(size, -1))
         count = int(np.sum((size > limit) & (size > beside)))
         if bdtrc(count - 1, n, _HEAVY) < _BY_CHANCE:

@@ -16,7 +16,7 @@ _RESTING = 1e-3  # of its span: how near 0 a level is that of rest
 _HARMLESS = 1e-4  # of a channel's variance
 _NEARBY = 8  # samples on either side, among which one stands out
 _SOME, _BRIEF = 4, 32  # samples of a burst
-_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
+MEDIAN_OF_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def noise(values: FloatArray) -> float:
     if len(v) < 8:
         return 0.0
     first, third = (
-        float(np.median(np.abs(np.diff(v, order)))) / _NORMAL / width
+        float(np.median(np.abs(np.diff(v, order)))) / MEDIAN_OF_NORMAL / width
         for order, width in ((1, np.sqrt(2.0)), (3, np.sqrt(20.0)))
     )
     return float(third) if third > 0.3 * first else 0.0
@@ -186,7 +186,7 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
     # Among others as large, as where an excitation turns every few samples, none stands alone.
     sizes = np.pad(np.where(np.isfinite(away), np.abs(away), rough), _NEARBY, "edge")
     nearby = np.median(np.lib.stride_tricks.sliding_window_view(sizes, 2 * _NEARBY + 1), axis=1)
-    usual = np.maximum(np.maximum(rough, nearby) / _NORMAL, resolution(values))
+    usual = np.maximum(np.maximum(rough, nearby) / MEDIAN_OF_NORMAL, resolution(values))
     at = np.zeros(n, dtype=np.bool_)
     with np.errstate(invalid="ignore"):
         at[1:-1] = returned & (np.abs(away) > 7.0 * usual) & (usual > 0.0)
@@ -198,7 +198,7 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
         # What follows a jump may be as large as what usually follows one.
         reaction = np.quantile(reactions, 0.9)
         at[1:-1] &= ~jolted[1:-1] | (np.abs(away) > 3.0 * reaction)
-    at |= _bursts(values, away, 7.0 * max(rough / _NORMAL, resolution(values)), jolted)
+    at |= _bursts(values, away, 7.0 * max(rough / MEDIAN_OF_NORMAL, resolution(values)), jolted)
     count = int(at.sum())
     if count == 0:
         return None
