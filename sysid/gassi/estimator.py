@@ -98,8 +98,8 @@ class GASSI(RecordEstimator):
     accuracy : normalised RMS error that a simulation aims at.
     max_steps : integration steps a sample may take before a chromosome is flagged.
     search_samples : of records that have more than twice as many samples, search and descents go
-        by parts of about so many, and only their minima are fitted to all; 0: all, always. Of the
-        presets that refine.
+        by parts of about so many, and only their minima are fitted to all; of short records that
+        repeat each other by a few of them; 0: all, always. Of the presets that refine.
     threads : default all cores; the result does not depend on their number.
     random_state : seed; equal seeds give equal results.
     dt : sample time [s] of arrays; Datasets bring their own.
@@ -286,7 +286,9 @@ class GASSI(RecordEstimator):
                 self._maximise_likelihood(searched, run.minima(), watch)
             return
         if weighs:
-            minima = promising(searched, run.minima(), watch)
+            # What looks like a filter's minimum it tells itself, by all of the records.
+            lookalike = self.criterion_ != "innovations"
+            minima = promising(searched, run.minima(), watch, lookalike=lookalike)
             minima = excerpt.on_all(searched.space, minima)[1]
             self._maximise_likelihood(objective, minima, watch, explored=True)
             return

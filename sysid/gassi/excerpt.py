@@ -24,6 +24,10 @@ from sysid.problem.space import SearchSpace
 _LENGTH = 1024  # samples of a part
 # Share of a part until what its start does not tell is forgotten: it is simulated, not compared.
 _RUN_IN = 0.25
+_REPEATED = 2048  # samples that tell enough where records repeat each other
+# Ratio of the mean squares of any combination of signals, of a record and those chosen, up to which
+# it repeats them.
+_ALIKE = 4.0
 _RIDGE = 1e-3  # moments of channels that do not move, in parts of one that does
 
 
@@ -44,15 +48,20 @@ class Excerpt:
 
     @classmethod
     def of(cls, records: Sequence[Dataset], samples: int, *, every: bool = True) -> Excerpt | None:
-        """An excerpt of about that many samples; None where it would not be half of all.
+        """An excerpt of about that many samples; None where it would be more than half of all.
 
         Of a record as many parts as its share, one at least; a record shorter than two parts whole.
-        Of every record, or of as many as it takes: a parameter may be told by one record alone.
+        Of every record, or of as many as it takes: a parameter may be told by one record alone. Of
+        short records that repeat each other a few in any case.
         """
         total = sum(record.n_samples for record in records)
-        if samples == 0 or total <= 2 * samples:
+        if samples == 0:
             return None
-        chosen = range(len(records)) if every else _telling_records(records, samples)
+        chosen: Sequence[int] = _repeated(records, min(samples, _REPEATED))
+        if not chosen:
+            if total <= 2 * samples:
+                return None
+            chosen = range(len(records)) if every else _telling_records(records, samples)
         share = samples / _LENGTH / sum(records[place].n_samples for place in chosen)
         parts: list[Part] = []
         for place in chosen:
@@ -61,7 +70,7 @@ class Excerpt:
             begins = [0] if whole else _telling(record, max(1, round(share * record.n_samples)))
             parts += [Part(place, begin, begin + _least(record)) for begin in begins]
         excerpt = cls(tuple(records), tuple(parts))
-        return excerpt if 2 * excerpt.n_samples < total else None
+        return excerpt if 2 * excerpt.n_samples <= total else None
 
     @property
     def places(self) -> list[int]:
@@ -141,12 +150,28 @@ def _least(record: Dataset) -> int:
     return record.n_samples if record.n_samples < 2 * _LENGTH else _LENGTH
 
 
+def _repeated(records: Sequence[Dataset], samples: int) -> list[int]:
+    """As ``_telling_records`` of short records that all are alike; none where one is not."""
+    if len(records) == 1 or any(record.n_samples > _least(record) for record in records):
+        return []
+    chosen, moments = _telling_records(records, samples), _mean_moments(records)
+    moments += _RIDGE * np.eye(moments.shape[1])
+    back = np.linalg.inv(np.linalg.cholesky(moments[chosen].mean(axis=0)))
+    ratios = np.linalg.eigvalsh(back @ moments @ back.T)
+    return chosen if ratios.max() < _ALIKE and ratios.min() > 1.0 / _ALIKE else []
+
+
+def _mean_moments(records: Sequence[Dataset]) -> FloatArray:
+    """Means of products of the signals of each, (n_records, n, n)."""
+    return np.array([signals.T @ signals / len(signals) for signals in _signals(records)])
+
+
 def _telling_records(records: Sequence[Dataset], samples: int) -> list[int]:
     """Places of the records that tell most together, sorted, of at least so many samples.
 
     With every output that is measured at all.
     """
-    moments = np.array([signals.T @ signals / len(signals) for signals in _signals(records)])
+    moments = _mean_moments(records)
     seen = np.array([np.isfinite(record.outputs).any(axis=0) for record in records])
     sizes = np.array([_least(record) for record in records])
     chosen = np.zeros(len(records), dtype=bool)

@@ -142,14 +142,18 @@ def _resting(best: Optimum) -> Optimum:
 
 
 def promising(
-    objective: Objective, minima: Sequence[FloatArray], watch: Watch | None = None
+    objective: Objective,
+    minima: Sequence[FloatArray],
+    watch: Watch | None = None,
+    *,
+    lookalike: bool = True,
 ) -> list[FloatArray]:
-    """Of some minima (n_free,) and their lookalikes those that more data may favour.
+    """Of some minima (n_free,), and perhaps their lookalikes, those that more data may favour.
 
     At most three, the best first; where they are is known roughly, for they are meant to be fitted
     to all data.
     """
-    optima = _explored(objective, minima, watch, lookalike=True, roughly=True)
+    optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=True)
     best, *others = optima.ranked()
     near = [rival for rival in others if optima.deviance(rival, best) < _TOLD_APART]
     return [optimum.chromosome for optimum in (best, *near)[:_MOST_PROMISING]]
@@ -397,10 +401,8 @@ def _refitted(
         explored = best
         starts += lookalikes(first.objective, best.chromosome) if filters else []
         ends = _conceivable(first.objective, starts, optima, best)
-        descents = [begin(first.objective, end.chromosome) for end in ends]
-        for end in refine_each(first.objective, descents):
-            rms = _exactly(first.objective).rms(end.chromosome[None])[0]
-            optima.add(_optimum(first.objective, end.chromosome, rms))
+        for optimum in _compared(first.objective, ends):
+            optima.add(optimum)
         (best, *others), starts = optima.ranked(), []
         if filters and optima.deviance(first, best) > _TOLD_APART:
             anew = fit(replace(best, objective=ranked[0].objective), watch)
@@ -415,6 +417,16 @@ def _refitted(
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
+
+
+def _compared(objective: Objective, ends: Sequence[Refinement]) -> list[Optimum]:
+    """Minima beside where descents have ended, as they are compared with ones far from them."""
+    if not ends:
+        return []
+    begun = [begin(objective, end.chromosome) for end in ends]
+    chromosomes = [end.chromosome for end in refine_each(objective, begun)]
+    errors = _exactly(objective).rms(np.stack(chromosomes))
+    return [_optimum(objective, *pair) for pair in zip(chromosomes, errors, strict=True)]
 
 
 def _exactly(objective: Objective) -> Objective:

@@ -157,3 +157,18 @@ def test_an_interrupted_search_of_an_excerpt_tells_the_error_of_all(long_record)
 def test_what_writes_the_thesis_searches_all_samples(long_record):
     estimator = GASSI(hidden_lag(), preset="thesis", search_samples=2048, **SETTINGS)
     assert estimator.fit(long_record).excerpt_ is None
+
+
+def test_of_short_records_that_repeat_each_other_a_few_are_enough():
+    rng = np.random.default_rng(3)
+
+    def repeated(size):
+        inputs = size * prbs(rng, 1000, -1.0, 1.0)
+        return Dataset(inputs, np.convolve(inputs, np.full(5, 0.2))[:1000], 0.01)
+
+    records = [repeated(1.0) for _ in range(5)]
+    assert Excerpt.of(records, 8192).n_samples == 2000
+    assert Excerpt.of(records[:3], 8192) is None  # two would be more than half
+    assert Excerpt.of(records, 0) is None
+    for size in (0.1, 10.0):
+        assert Excerpt.of([*records, repeated(size)], 8192) is None
