@@ -5,9 +5,11 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+R = TypeVar("R")
 
 
 @contextmanager
@@ -63,6 +65,16 @@ class Workers:
                     worker.result()
         finally:
             deque(queue, maxlen=0)  # after an interrupt nothing more is begun
+
+    def results(self, function: Callable[[Any], R], tasks: Sequence[Any]) -> list[R]:
+        """What a function returns of every task, in their order."""
+        results: dict[int, R] = {}
+
+        def run(place: int) -> None:
+            results[place] = function(tasks[place])
+
+        self.each(run, range(len(tasks)))
+        return [results[place] for place in range(len(tasks))]
 
     def _ready(self) -> ThreadPoolExecutor:
         # A forked process inherits the pool without its threads.

@@ -168,21 +168,20 @@ class RecordSimulator:
         self,
         parameters: FloatArray,
         starts: FloatArray | None,
-        rows: slice,
+        lanes: IntArray,
         n_steps: int,
         values: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Simulate up to LANES rows of the parameters at so many steps per sample.
 
-        values: (n_samples, n_outputs, n), filled with their residuals; without samples none are
-        kept. Returns the residuals' sums of squares, (n, n_outputs), and error estimates in parts
-        of what the accuracy allows, (n,).
+        values: (n_samples, n_outputs, n) of all rows, filled with the residuals of these; without
+        samples none are kept. Returns the residuals' sums of squares, (n, n_outputs), and error
+        estimates in parts of what the accuracy allows, (n,).
         """
         kept = np.empty((len(values), values.shape[1], LANES))
-        lanes = np.arange(rows.start, rows.stop)
         n_samples = self.record.n_samples
         sse, estimates = self.block(parameters, starts, lanes, n_steps, n_samples, kept)
-        values[:] = kept[..., : len(lanes)]
+        values[..., _neighbours(lanes)] = kept[..., : len(lanes)]
         return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * (n_samples - 1)))
 
     def innovations(
@@ -196,7 +195,7 @@ class RecordSimulator:
         exact: bool,
         parameters: FloatArray,
         starts: FloatArray | None,
-        rows: slice,
+        lanes: IntArray,
         n_steps: int,
         values: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
@@ -212,7 +211,6 @@ class RecordSimulator:
         (n, n_outputs).
         """
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
-        lanes = np.arange(rows.start, rows.stop)
         padded = lanes.take(_ALL_LANES, mode="wrap")
         first = [*record.starts_at_samples(model), *[None] * kernel.n_states]
         weights = self._weights.copy()
@@ -245,7 +243,7 @@ class RecordSimulator:
                 intensity, np.array(spread), float(corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
             )  # fmt: skip
-        values[:] = kept[..., : len(lanes)]
+        values[..., _neighbours(lanes)] = kept[..., : len(lanes)]
         sse, logarithms = (half.T[: len(lanes)] for half in np.split(sums, 2))
         return sse, logarithms
 
@@ -531,6 +529,12 @@ def _rungs(steps: FloatArray) -> IntArray:
     wanted = np.where(np.isfinite(steps), np.maximum(steps, 1.0), np.inf)
     rung = np.searchsorted(_LADDER, np.minimum(wanted, _LADDER[-1]) - 1e-9)
     return np.where(wanted > _LADDER[-1], np.iinfo(np.int64).max, _LADDER[rung])
+
+
+def _neighbours(lanes: IntArray) -> slice | IntArray:
+    """Lanes as a slice where they are neighbours, which takes less."""
+    first, last = int(lanes[0]), int(lanes[-1])
+    return slice(first, last + 1) if last - first == len(lanes) - 1 else lanes
 
 
 def blocks_of(lanes: IntArray) -> list[IntArray]:

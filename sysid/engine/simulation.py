@@ -189,13 +189,12 @@ class BatchSimulator:
         """
 
         def simulate(
-            r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
+            r: int, simulator: RecordSimulator, values: FloatArray, lanes: IntArray, steps: int
         ) -> tuple[FloatArray, FloatArray]:
-            values = part[..., rows]
-            return simulator.residuals(parameters, starts[r], rows, steps, values)
+            return simulator.residuals(parameters, starts[r], lanes, steps, values)
 
         parameters = self._check(parameters, records)
-        return self._gathered(simulate, parameters, records, scales, n_steps, keep=keep)
+        return self._gathered(simulate, parameters, records, scales, n_steps, starts, keep=keep)
 
     def innovations(
         self,
@@ -243,19 +242,20 @@ class BatchSimulator:
             scatter = [np.zeros(record.outputs.shape) for record in records]
 
         def simulate(
-            r: int, simulator: RecordSimulator, part: FloatArray, rows: slice, steps: int
+            r: int, simulator: RecordSimulator, values: FloatArray, lanes: IntArray, steps: int
         ) -> tuple[FloatArray, FloatArray]:
-            values = part[..., rows]
-            sse, logarithms[rows, r] = simulator.innovations(
+            sse, logarithms[lanes, r] = simulator.innovations(
                 kalman, noise, scatter[r], process, colours[r], corrects, exact, parameters,
-                starts[r], rows, steps, values,
+                starts[r], lanes, steps, values,
             )  # fmt: skip
             return sse, np.where(np.isfinite(sse).all(axis=1), 0.0, np.inf)
 
         parameters = self._check(parameters, records)
-        innovations = self._gathered(simulate, parameters, records, scales, n_steps)
+        innovations = self._gathered(simulate, parameters, records, scales, n_steps, starts)
         if not (driven and balanced):
             return innovations
+        for r in range(len(records)):
+            logarithms[:, r] = logarithms[_first_alike(parameters, starts[r], n_steps[:, r]), r]
         samples = sum(np.isfinite(record.outputs).sum(axis=0) for record in records)
         factor = np.exp(0.5 * logarithms.sum(axis=1) / np.maximum(samples, 1))
         return replace(
@@ -344,27 +344,53 @@ class BatchSimulator:
         records: Sequence[Dataset],
         scales: Sequence[FloatArray | None],
         n_steps: IntArray,
+        starts: Sequence[FloatArray | None],
         *,
         keep: bool = True,
     ) -> Residuals:
-        """What is simulated of every parameter vector on every record, in blocks side by side."""
+        """What is simulated of every parameter vector on every record, in blocks side by side.
+
+        Those that are alike on a record once: most do not know where the others start.
+        """
         n, q = len(parameters), len(self.model.outputs)
         sse, excess = np.empty((n, len(records), q)), np.empty((n, len(records)))
         ends = np.cumsum([record.n_samples for record in records])
         values = np.empty((ends[-1] if keep else 0, q, n))
-        tasks = []
+        tasks, copies = [], []
         for r, (record, end) in enumerate(zip(records, ends, strict=True)):
             part = values[end - record.n_samples : end]
-            tasks += [(r, self._on(record, scales[r]), part, *run) for run in _runs(n_steps[:, r])]
+            first = _first_alike(parameters, starts[r], n_steps[:, r])
+            alone = np.flatnonzero(first == np.arange(n))
+            simulator = self._on(record, scales[r])
+            tasks += [
+                (r, simulator, part, alone[run], steps) for run, steps in _runs(n_steps[alone, r])
+            ]
+            if len(alone) < n:
+                copies.append((r, part, first))
         # What takes longest is begun first.
         tasks.sort(key=lambda task: -task[4] * task[1].record.n_samples)
 
-        def run(task: tuple[int, RecordSimulator, FloatArray, slice, int]) -> None:
-            r, rows = task[0], task[3]
-            sse[rows, r], excess[rows, r] = simulate(*task)
+        def run(task: tuple[int, RecordSimulator, FloatArray, IntArray, int]) -> None:
+            r, lanes = task[0], task[3]
+            sse[lanes, r], excess[lanes, r] = simulate(*task)
+
+        def copy(task: tuple[int, FloatArray, IntArray]) -> None:
+            r, part, first = task
+            again = np.flatnonzero(first != np.arange(n))
+            part[..., again] = part[..., first[again]]
+            sse[again, r], excess[again, r] = sse[first[again], r], excess[first[again], r]
 
         self._workers.each(run, tasks)
+        self._workers.each(copy, copies)
         return Residuals(values, sse, excess)
+
+    def steps_needed(self, parameters: FloatArray, records: Sequence[Dataset]) -> IntArray:
+        """Integration steps per sample that each parameter vector needs, (n, n_records)."""
+
+        def needed(record: Dataset) -> IntArray:
+            return self.steps_of_each(parameters, record)
+
+        return np.stack(self._workers.results(needed, records), axis=1)
 
     def steps_of_each(
         self, parameters: FloatArray, record: Dataset, starts: FloatArray | None = None
@@ -415,6 +441,19 @@ def noisy_inputs(records: Sequence[Dataset]) -> tuple[int, ...]:
     """Places of the inputs that are measured with noise in any of the records."""
     noise = np.max([record.input_noise for record in records], axis=0)
     return tuple(np.flatnonzero(noise).tolist())
+
+
+def _first_alike(parameters: FloatArray, start: FloatArray | None, steps: IntArray) -> IntArray:
+    """For each row the first that has its parameters, its start and its steps, (n,).
+
+    Where all start alike they are taken to differ.
+    """
+    if start is None or not np.any(start != start[:1]):
+        return np.arange(len(steps))
+    rows = np.ascontiguousarray(np.hstack([parameters, start, steps[:, None]]))
+    keys = rows.view(f"V{rows.itemsize * rows.shape[1]}")[:, 0]
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    return np.asarray(first[inverse], dtype=np.int64)
 
 
 def _runs(steps: IntArray) -> list[tuple[slice, int]]:

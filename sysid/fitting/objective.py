@@ -196,8 +196,7 @@ class Objective:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""
         vectors = self.space.full(chromosomes)
         self._counter[0] += len(vectors)
-        steps = [self.simulator.steps_of_each(vectors, record) for record in self.records]
-        return np.stack(steps, axis=1)
+        return self.simulator.steps_needed(vectors, self.records)
 
     def error_of(self, rms: FloatArray) -> FloatArray:
         """The error E of outputs' errors r (n, n_outputs), (n,), infinite where one failed."""

@@ -167,6 +167,9 @@ class Formula:
     def steps_of_each(self, vectors, record):
         return np.ones(len(vectors), dtype=int)
 
+    def steps_needed(self, vectors, records):
+        return np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
+
     def trajectories(self, vectors, record, n_steps=None, starts=None):
         names = self.model.parameter_names
         return np.stack(
@@ -180,12 +183,12 @@ class Formula:
             found[:, ~np.isfinite(record.outputs)] = 0.0
             parts.append(found)
         sse = np.stack([np.sum(part**2, axis=1) for part in parts], axis=1)
-        needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
+        needed = self.steps_needed(vectors, records)
         values = np.moveaxis(np.concatenate(parts, axis=1), 0, 2).copy()
         return Residuals(values, sse, needed / n_steps)
 
     def errors(self, vectors, records, scales, starts):
-        needed = np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
+        needed = self.steps_needed(vectors, records)
         sse = self.residuals(vectors, records, scales, needed, starts).sse
         return BatchResult(sse, np.zeros(len(vectors), dtype=int), needed.sum(axis=1))
 

@@ -269,6 +269,24 @@ def test_records_of_different_length_and_rate_are_kept_apart():
 # --- the same bits --------------------------------------------------------------------------
 
 
+def test_where_other_records_start_changes_nothing():
+    model, rng = motor(), np.random.default_rng(0)
+    parameters = draw(motor(1.3), rng, 2)[[0, 0, 0, 1, 0]]
+    records = [motor_record(100), motor_record(90)]
+    starts = [rng.standard_normal((5, len(model.states))) for _ in records]
+    starts[0][[1, 2, 4]], starts[1][[2, 4]] = starts[0][0], starts[1][0]
+    scales, steps = [np.ones(len(model.outputs))] * 2, np.array([[4, 8]] * 4 + [[6, 8]])
+    simulator = BatchSimulator(model)
+    together = simulator.residuals(parameters, records, scales, steps, starts)
+    for row in range(5):
+        alone = simulator.residuals(
+            parameters[[row]], records, scales, steps[[row]], [start[[row]] for start in starts]
+        )
+        assert np.array_equal(together.values[..., row], alone.values[..., 0])
+        assert np.array_equal(together.sse[row], alone.sse[0])
+        assert np.array_equal(together.excess[row], alone.excess[0])
+
+
 @pytest.mark.parametrize("threads", [2, 3])
 def test_threads_do_not_change_a_bit(threads):
     vectors = draw(motor(), np.random.default_rng(9), 70)
