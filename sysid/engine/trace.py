@@ -7,6 +7,7 @@ import numbers
 import operator
 import types
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -116,6 +117,25 @@ def evaluated(function: Any, *sides: FloatArray) -> FloatArray:
         values = [tape.value(operand(value)) for value in followed(function)(*arguments)]
     rows = np.zeros(max(map(len, sides)))
     return np.stack([rows + value for value in values], axis=1)
+
+
+def rates_along(
+    derivative: Callable[..., Any], states: FloatArray, inputs: FloatArray, parameters: FloatArray
+) -> FloatArray:
+    """A model's rates along a run, (n_samples, n_states), NaN where they fail.
+
+    states: (n_samples, n_states); inputs: (n_samples, n_inputs); parameters: (n_parameters,).
+    """
+    with suppress(Exception):  # it may do more than can be followed at many points at once
+        return evaluated(derivative, states, inputs, parameters[None])
+    p = tuple(parameters.tolist())
+    rates = np.full(states.shape, np.nan)
+    for row, x, u in zip(rates, states.tolist(), inputs.tolist(), strict=True):
+        try:
+            row[:] = derivative(tuple(x), tuple(u), p)
+        except (ArithmeticError, ValueError):
+            continue
+    return rates
 
 
 def traces(tape: Tape, letter: str, count: int) -> tuple[Trace, ...]:

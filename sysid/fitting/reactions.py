@@ -15,6 +15,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.stepper import Stepper
+from sysid.engine.trace import rates_along
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 
@@ -34,9 +35,7 @@ def with_reactions(
     with np.errstate(over="ignore", invalid="ignore"):
         trace, _ = stepper.advance(end, record.inputs)
         states = np.vstack([trace[:: stepper.n_steps], end])
-        p = tuple(parameters.tolist())
-        rows = zip(states.tolist(), record.inputs.tolist(), strict=True)
-        rates = np.array([model.derivative(tuple(x), tuple(u), p) for x, u in rows])
+        rates = rates_along(model.derivative, states, record.inputs, parameters)
         bends = np.diff(states, axis=0) / record.dt - 0.5 * (rates[1:] + rates[:-1])
     between = np.zeros_like(record.inputs)
     for j in reacting:

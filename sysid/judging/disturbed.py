@@ -7,18 +7,18 @@ equation would do: the function's values along the run are that input's samples.
 """
 
 import functools
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.stepper import Stepper
-from sysid.engine.trace import evaluated
+from sysid.engine.trace import rates_along
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ModelError, ProcessModel
+from sysid.threads import Workers
 
 _ACCURACY = 1e-6
 _BASE_STEPS = 2
@@ -69,14 +69,15 @@ class DisturbedRun:
     """A free run of a record under parameters (n_parameters,), and what disturbances change.
 
     start: (n_states,), where it begins. states: (n_samples, n_states) and outputs: (n_samples,
-    n_outputs) of the undisturbed run. rates: (n_samples, n_states), its f(x, u, p). Raises
-    ModelError where the run does not stay finite.
+    n_outputs) of the undisturbed run. rates: (n_samples, n_states), its f(x, u, p). workers: that
+    runs share, to be disturbed side by side. Raises ModelError where the run does not stay finite.
     """
 
     model: ProcessModel
     vector: FloatArray
     record: Dataset
     start: FloatArray
+    workers: Workers = field(default_factory=lambda: Workers(1))
 
     def __post_init__(self) -> None:
         whole = with_added_inputs(self.model)
@@ -104,17 +105,7 @@ class DisturbedRun:
 
     def rates_of(self, derivative: Callable[..., Any], vector: FloatArray) -> FloatArray:
         """Values of another derivative along the run, (n_samples, n_states), NaN where it fails."""
-        with suppress(Exception):  # it may do more than can be followed at many points at once
-            return evaluated(derivative, self.states, self.record.inputs, vector[None])
-        p = tuple(vector.tolist())
-        values = np.full(self.states.shape, np.nan)
-        rows = zip(self.states.tolist(), self.record.inputs.tolist(), strict=True)
-        for row, (x, u) in zip(values, rows, strict=True):
-            try:
-                row[:] = derivative(tuple(x), tuple(u), p)
-            except (ArithmeticError, ValueError):
-                continue
-        return values
+        return rates_along(derivative, self.states, self.record.inputs, vector)
 
     def added(self, rates: FloatArray) -> FloatArray:
         """Change of the outputs per unit of what is added to the rates, both (n_samples, ...)."""
@@ -161,3 +152,10 @@ class DisturbedRun:
         return self._stepper.advance(
             (self.start if start is None else start).copy(), np.ascontiguousarray(signals)
         )[1]
+
+
+def of_each(
+    runs: Sequence[DisturbedRun], change: Callable[[DisturbedRun], FloatArray]
+) -> FloatArray:
+    """Changes (n_rows, n_outputs) of all runs, records one after another."""
+    return np.concatenate(runs[0].workers.results(change, runs))

@@ -19,7 +19,7 @@ the smallest probability is taken into the regression, and the rest asked again.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -28,7 +28,7 @@ from scipy.special import chdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.objective import Objective
-from sysid.judging.disturbed import DisturbedRun
+from sysid.judging.disturbed import DisturbedRun, of_each
 from sysid.judging.suspects import (
     Kind,
     Suspect,
@@ -43,6 +43,7 @@ from sysid.judging.suspects import (
 )
 from sysid.problem.model import ModelError
 from sysid.problem.terms import AddedTerm
+from sysid.threads import Workers
 from sysid.uncertainty import Estimate, Uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, longest_memory, record_rows
 from sysid.uncertainty.sensitivity import (
@@ -59,7 +60,7 @@ _SEVERAL = ("variant", "function", "disturbance")  # have no single amplitude
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
-_LIKELY = 8  # suspects that are tested again by the colour of what they leave
+_LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
 _LAGS = 20  # of what colour whitening may leave
 _FORGETS = 20  # samples of a record that count as independent, from where its mean is no colour
 _NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
@@ -159,7 +160,7 @@ def missing_physics(
     # Noise of an input makes its gain look smaller: that is no fault.
     channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
     foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
-    tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs, local))
+    tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs, local), runs[0].workers)
     alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
     channels += in_single_records([s for s in channels if s.kind != "noise"], runs)
     tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
@@ -171,10 +172,10 @@ def missing_physics(
 def _runs(local: Sensitivity) -> list[DisturbedRun]:
     objective, chromosomes = local.objective, local.chromosome[None]
     model, vector = objective.simulator.model, objective.space.full(chromosomes)[0]
-    runs = []
+    workers, runs = Workers(objective.simulator.threads), []
     for k, record in enumerate(objective.records):
         start = objective.space.starts(chromosomes, k, record.initial_state(model))[0]
-        runs.append(DisturbedRun(model, vector, record, start))
+        runs.append(DisturbedRun(model, vector, record, start, workers))
     return runs
 
 
@@ -186,15 +187,18 @@ def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
     """
     records = [run.record for run in runs]
     columns = []
-    for i in np.flatnonzero(np.any([record.input_noise for record in records], axis=0)):
-        parts = []
-        for run in runs:
-            part = np.zeros(run.record.inputs.shape)
-            part[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
-            parts.append(run.driven(part))
-        columns.append(np.concatenate(parts))
+    noisy = np.any([record.input_noise for record in records], axis=0)
+    for i in np.flatnonzero(noisy).tolist():
+        columns.append(of_each(runs, partial(_likely_noise, i)))
     n = sum(record.n_samples for record in records)
     return np.stack(columns, axis=2) if columns else np.zeros((n, runs[0].outputs.shape[1], 0))
+
+
+def _likely_noise(i: int, run: DisturbedRun) -> FloatArray:
+    """What the noise of input i is likely to have done to the outputs, (n_samples, n_outputs)."""
+    part = np.zeros(run.record.inputs.shape)
+    part[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
+    return run.driven(part)
 
 
 def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
@@ -240,12 +244,14 @@ class _Tests:
         uncertainty: Uncertainty,
         foreseen: FloatArray,
         chance: FloatArray,
+        workers: Workers,
     ) -> None:
         """Of changes that are there whatever is missing, (n_residuals, n_outputs, k) each.
 
         foreseen: of any size. chance: by one standard deviation of what is known to be so large.
         """
         self.findings: list[Finding] = []
+        self._workers = workers
         self._local, self._residual = local, -local.residual
         self._estimates = [e for e in uncertainty.determined() if e.deviation]
         gradients = [_gradient(local, e) for e in self._estimates]
@@ -281,7 +287,11 @@ class _Tests:
         tests = len(late) + sum(suspects[i].late is None for i in left)
         while left and len(self.findings) < _MOST:
             first = self._likeliest(changes, suspects, left)
-            results = {i: self._again(changes[i], suspects[i], test) for i, test in first.items()}
+            again = self._workers.results(
+                lambda task: self._again(*task),
+                [(changes[i], suspects[i], test) for i, test in first.items()],
+            )
+            results = dict(zip(first, again, strict=True))
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
             significant = [i for i in logs if logs[i] < np.log(_CHANCE)]
             if not significant:
@@ -317,16 +327,22 @@ class _Tests:
 
         In order of what the probabilities are at least, until the rest cannot be among them.
         """
-        least = {i: self._regression.least(changes[i], suspects[i].one_sided) for i in left}
+        bounds = self._workers.results(
+            lambda i: self._regression.least(changes[i], suspects[i].one_sided), left
+        )
+        least = dict(zip(left, bounds, strict=True))
+        order = sorted(left, key=lambda i: least[i])
         tests: dict[int, _Result] = {}
         likely: list[int] = []
-        for i in sorted(left, key=lambda i: least[i]):
-            if len(likely) == _LIKELY and least[i] > tests[likely[-1]].log_p:
+        for first in range(0, len(order), _LIKELY):
+            wave = order[first : first + _LIKELY]
+            if len(likely) == _LIKELY and least[wave[0]] > tests[likely[-1]].log_p:
                 break
-            result = self._regression.test(changes[i], suspects[i].one_sided)
-            if result is None:
-                continue
-            tests[i], likely = result, []
+            results = self._workers.results(
+                lambda i: self._regression.test(changes[i], suspects[i].one_sided), wave
+            )
+            tests |= {i: result for i, result in zip(wave, results, strict=True) if result}
+            likely = []
             for k in sorted(tests, key=lambda k: (tests[k].log_p, k)):
                 if len(likely) < _LIKELY and not any(suspects[k].same(suspects[j]) for j in likely):
                     likely.append(k)
@@ -350,11 +366,12 @@ class _Tests:
     ) -> tuple[FloatArray, "_Result", FloatArray]:
         """Changes, test and what is left of a delay as large as explains most of the residuals."""
         assert suspect.late is not None
-        regression, little = self._coloured_by(residual), float(result.amplitudes[0])
+        regression = self._coloured_by(residual)
+        delays = (float(result.amplitudes[0]) * np.linspace(*_TIMES)).tolist()
+        late = [suspect.late(delay) / self._scales[..., None] for delay in delays]
+        tests = self._workers.results(lambda each: regression.test(each, suspect.one_sided), late)
         best = None
-        for delay in little * np.linspace(*_TIMES):
-            changes = suspect.late(delay) / self._scales[..., None]
-            test = regression.test(changes, suspect.one_sided)
+        for delay, changes, test in zip(delays, late, tests, strict=True):
             if test is not None and (best is None or test.share > best[1].share):
                 best = changes, test, delay
         if best is None:
@@ -530,11 +547,13 @@ class _Regression:
 
     def _pushes(self, left: FloatArray) -> FloatArray:
         """Changes of the score by draws of the inputs' noise, (k, n_draws of all records)."""
-        pushes = []
-        for rows, noise in self._noises:
-            back = self.whitening.transposed(rows, left[self.whitening.rows_of(rows)])
-            pushes.append(np.tensordot(back, noise, axes=([0, 1], [0, 1])))
-        return np.hstack(pushes)
+        return np.hstack([left[places].T @ noise for places, noise in self._white_noises])
+
+    @cached_property
+    def _white_noises(self) -> list[tuple[slice, FloatArray]]:
+        """Whitened rows of each record, and the changes of its residuals by draws of the noise."""
+        whitening = self.whitening
+        return [(whitening.rows_of(r), whitening.of_record(r, noise)) for r, noise in self._noises]
 
 
 class _Basis:
@@ -698,17 +717,6 @@ class _Whitening:
         white: FloatArray = (self._filter @ past)[self.kept[rows][order:]]
         whole[:, felt] = white.reshape(len(whole), -1)
         return whole
-
-    def transposed(self, rows: slice, white: FloatArray) -> FloatArray:
-        """What whitened columns of one record weigh its residuals by, (n_samples, n_outputs, k)."""
-        kept, order, q = self.kept[rows], len(self.model.coefficients), self.n_outputs
-        n, k = len(kept) - order, white.shape[1]
-        whole = np.zeros((n, q, k))
-        whole[kept[order:]] = white.reshape(-1, q, k)
-        back = np.zeros((len(kept), q, k))
-        for lag in range(order + 1):
-            back[lag : lag + n] += self._filter[:, lag * q : (lag + 1) * q].T @ whole
-        return back
 
     def rows_of(self, rows: slice) -> slice:
         """Rows of the whitened columns of one record, by its rows of the residuals."""

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.judging.disturbed import DisturbedRun
+from sysid.judging.disturbed import DisturbedRun, of_each
 from sysid.linear.polynomials import all_pole
 from sysid.problem.channels import noise
 from sysid.problem.data import Dataset
@@ -108,9 +108,9 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         yield from _noises(given, runs, i)
         zeroed = any(run.record.input_zero[i] for run in runs)
         for kind, signal in _faults(partial(_input, i), zeroed):
-            parts = [run.driven(_column(run.record.inputs, i, signal(run))) for run in runs]
             # By what a log has too much, less has acted.
-            changes = np.concatenate(parts) * (-1.0 if kind in ("offset", "drift") else 1.0)
+            sign = -1.0 if kind in ("offset", "drift") else 1.0
+            changes = sign * _driven(runs, i, signal)
             unit = _unit(kind, given.unit)
             yield Suspect(kind, given.name, unit, changes[..., None], of_input=True)
 
@@ -127,11 +127,11 @@ def _late(
 
 
 def _late_output(runs: Sequence[DisturbedRun], j: int, delay: float) -> FloatArray:
-    parts = [
-        _column(run.outputs, j, _shifted(run.outputs[:, j], -delay / run.record.dt, False))
-        for run in runs
-    ]
-    return np.concatenate(parts)[..., None]
+    def late(run: DisturbedRun) -> FloatArray:
+        shifted = _shifted(run.outputs[:, j], -delay / run.record.dt, False)
+        return _column(run.outputs, j, shifted)
+
+    return of_each(runs, late)[..., None]
 
 
 def _filtered_output(runs: Sequence[DisturbedRun], j: int, time: float) -> FloatArray:
@@ -147,8 +147,14 @@ _Change = Callable[[DisturbedRun, int, float], FloatArray]
 def _input_changed(
     runs: Sequence[DisturbedRun], i: int, change: _Change, size: float
 ) -> FloatArray:
-    parts = [run.driven(_column(run.record.inputs, i, change(run, i, size))) for run in runs]
-    return np.concatenate(parts)[..., None]
+    return _driven(runs, i, lambda run: change(run, i, size))[..., None]
+
+
+def _driven(
+    runs: Sequence[DisturbedRun], i: int, signal: Callable[[DisturbedRun], FloatArray]
+) -> FloatArray:
+    """Changes by a signal (n_samples,) of each record beside what is logged of an input."""
+    return of_each(runs, lambda run: run.driven(_column(run.record.inputs, i, signal(run))))
 
 
 def _plays(
@@ -171,11 +177,8 @@ def _noises(given: Input, runs: Sequence[DisturbedRun], i: int) -> Iterator[Susp
     size = input_noise(records, i)
     if any(record.input_noise[i] for record in records) or not size:
         return
-    parts = [
-        run.driven(_column(run.record.inputs, i, likely_noise(run.record.inputs[:, i], size)))
-        for run in runs
-    ]
-    changes = -np.concatenate(parts)[..., None] / size
+    changes = _driven(runs, i, lambda run: likely_noise(run.record.inputs[:, i], size))
+    changes = -changes[..., None] / size
     yield Suspect("noise", given.name, given.unit, changes, of_input=True)
 
 
@@ -351,11 +354,12 @@ def variant_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         added = [i for i, k in enumerate(variant.parameter_names) if k not in values]
         free = [i for i in added if not variant.parameters[i].fixed]
         moved = [at, *(p for i in free for p in _moved(variant, at, i))]
-        columns = []
-        for p in moved:
-            parts = [run.added(run.rates_of(variant.derivative, p) - run.rates) for run in runs]
-            columns.append(np.concatenate(parts))
+        columns = [of_each(runs, partial(_as_variant, variant, p)) for p in moved]
         yield Suspect("variant", name, "", np.stack(columns, axis=2))
+
+
+def _as_variant(variant: ProcessModel, vector: FloatArray, run: DisturbedRun) -> FloatArray:
+    return run.added(run.rates_of(variant.derivative, vector) - run.rates)
 
 
 def _moved(variant: ProcessModel, vector: FloatArray, place: int) -> Iterator[FloatArray]:
@@ -384,9 +388,13 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             if len(np.unique(together)) < _LEVELS or _jumps(together):
                 continue
             for terms in _terms(state.name, signal.name, together):
-                columns = [_added(runs, i, _values(term, together)) for term in terms]
+                columns = [_added(runs, i, partial(_term_along, term, j)) for term in terms]
                 unit = f"{state.unit}/s"
                 yield Suspect("function", state.name, unit, np.stack(columns, axis=2), terms)
+
+
+def _term_along(term: AddedTerm, j: int, run: DisturbedRun) -> FloatArray:
+    return _values(term, _signal(run, j))
 
 
 def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[AddedTerm, ...]]:
@@ -431,10 +439,7 @@ def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     ]
     for i in _physical_equations(runs[0]):
         state = runs[0].model.states[i]
-        columns = [
-            np.concatenate([run.added(_column(run.states, i, wave(run))) for run in runs])
-            for wave in waves
-        ]
+        columns = [_added(runs, i, wave) for wave in waves]
         yield Suspect("disturbance", state.name, f"{state.unit}/s", np.stack(columns, axis=2))
 
 
@@ -450,11 +455,14 @@ def change_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Itera
     for name in names:
         place, moved = model.parameter_names.index(name), vector.copy()
         moved[place] *= 1.0 + _PROBE
-        columns = []
-        for run in runs:
-            rates = (run.rates_of(model.derivative, moved) - run.rates) / _PROBE
-            columns.append(run.added(rates * np.linspace(-0.5, 0.5, len(rates))[:, None]))
-        yield Suspect("change", name, "1", np.concatenate(columns)[..., None])
+        changes = of_each(runs, partial(_drifting, moved))
+        yield Suspect("change", name, "1", changes[..., None])
+
+
+def _drifting(moved: FloatArray, run: DisturbedRun) -> FloatArray:
+    """Change by parameters that move by a part of what others differ by, in proportion to time."""
+    rates = (run.rates_of(run.model.derivative, moved) - run.rates) / _PROBE
+    return run.added(rates * np.linspace(-0.5, 0.5, len(rates))[:, None])
 
 
 def _jumps(signal: FloatArray) -> bool:
@@ -467,11 +475,11 @@ def _signal(run: DisturbedRun, j: int) -> FloatArray:
     return run.states[:, j] if j < n else run.record.inputs[:, j - n]
 
 
-def _added(runs: Sequence[DisturbedRun], i: int, values: FloatArray) -> FloatArray:
-    """Change by values, of all records' rows, added to equation i."""
-    ends = np.cumsum([run.record.n_samples for run in runs])[:-1]
-    parts = zip(runs, np.split(values, ends), strict=True)
-    return np.concatenate([run.added(_column(run.states, i, part)) for run, part in parts])
+def _added(
+    runs: Sequence[DisturbedRun], i: int, signal: Callable[[DisturbedRun], FloatArray]
+) -> FloatArray:
+    """Changes by a signal (n_samples,) of each run that is added to equation i."""
+    return of_each(runs, lambda run: run.added(_column(run.states, i, signal(run))))
 
 
 def _physical_equations(run: DisturbedRun) -> list[int]:
