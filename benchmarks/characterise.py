@@ -1,21 +1,25 @@
 """What `rig characterise` tells of hidden rigs, beside 8 runs of the shipped PRBS.
 
 python -m benchmarks.characterise [--json] [--rigs 3] [--first 0] [--time 10]
-                                 [--model actuator:limits=true]
+                                 [--model actuator:limits=true] [--keep FOLDER]
 
 Each rig is the simulated one with the model's nominal values, each times a factor of 0.6 to 1.6
 drawn anew. It is characterised from the model's ranges within 10 s of logged time; the same rig
 then makes 8 runs of the shipped PRBS, 10 s, with seeds of their own, which are identified together.
 Figures: geometric mean of the ratio of the intervals' widths (of a quantity that the PRBS does not
 bound the ratio counts none), the widest interval, how many hold the truth, and achieved over
-predicted deviations.
+predicted deviations; of each round the same on standard error as it ends, with the runs that
+limits stopped and seconds of processor time. --keep: where the characterisations stay, one folder
+a rig; one that is there is gone on with.
 """
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +28,13 @@ import yaml
 
 from benchmarks._common import arguments, prbs_logs, report
 from daq.characterise import characterise
-from daq.characterise.rounds import Interval, Round
+from daq.characterise.rounds import Interval, Round, rounds_of
 from daq.identification.fit import fit
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.lookup.models import DRIVEN_MODEL, find_model
 from daq.lookup.shipped import find_file
+from daq.progress import Started
 from sim_rig.actuator import actuator
 from sysid import identifiability
 from sysid.experiments.quantities import determined
@@ -46,25 +51,25 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
     parser.add_argument("--time", type=float, default=10.0, help="logged time [s]")
     parser.add_argument("--model", default=DRIVEN_MODEL, help="that is identified")
+    parser.add_argument("--keep", type=Path, help="folder in which the characterisations stay")
     options = parser.parse_args()
     numbers = range(options.first, options.first + options.rigs)
-    rigs = [hidden_rig(number, options.time, options.model) for number in numbers]
+    with tempfile.TemporaryDirectory() as temporary:
+        place = options.keep or Path(temporary)
+        rigs = [
+            hidden_rig(number, options.time, options.model, place / f"rig-{number}")
+            for number in numbers
+        ]
     report({"rigs": rigs}, options.json, show)
 
 
-def hidden_rig(number: int, seconds: float, name: str) -> dict[str, Any]:
+def hidden_rig(number: int, seconds: float, name: str, folder: Path) -> dict[str, Any]:
     """Figures of one rig, by the name of the model that is identified."""
-    model, truth = find_model(name), hidden_parameters(number)
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        rig = _rig_file(folder, number, truth)
-        begin = time.perf_counter()
-        designed = characterise.characterise(rig, seconds, None, folder / "c", model=name)
-        spent = time.perf_counter() - begin
-        shipped = _shipped(folder, rig, designed.rounds[-1], number, name)
-    nominal = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
-    structure, space = identifiability(model, sensors=False), SearchSpace.of(model)
-    values = {q.text: q.value({**nominal, **truth}) for q in determined(structure, space)}
+    values = hidden_values(number, name)
+    begin = time.perf_counter()
+    designed, rounds = _characterised(folder, number, seconds, name)
+    spent = time.perf_counter() - begin
+    shipped = _shipped(folder, folder / "rig.yaml", designed.rounds[-1], number, name)
     bounded = [i for i in designed.intervals if i.width is not None]
     pairs = [(i.width, shipped[i.name].width) for i in bounded if shipped[i.name].width]
     ratios = [prbs / width for width, prbs in pairs if width and prbs]
@@ -72,6 +77,7 @@ def hidden_rig(number: int, seconds: float, name: str) -> dict[str, Any]:
         "rig": number,
         "seconds": spent,
         "logged": designed.seconds,
+        "rounds": rounds,
         "quantities": {
             i.name: {
                 "designed": i.width,
@@ -82,12 +88,80 @@ def hidden_rig(number: int, seconds: float, name: str) -> dict[str, Any]:
             }
             for i in designed.intervals
         },
-        "narrower": float(np.exp(np.mean(np.log(ratios)))) if ratios else None,
+        "narrower": _mean(ratios),
         "unbounded_by_prbs": sum(i.width is None for i in shipped.values()),
         "unbounded": len(designed.intervals) - len(bounded),
         "covered": _share_covered(designed.intervals, values),
         "covered_by_prbs": _share_covered(shipped.values(), values),
     }
+
+
+@dataclass
+class _Rounds:
+    """Figures of each round as it ends, told while the next begins."""
+
+    root: Path
+    values: Mapping[str, float]
+    figures: list[dict[str, Any]] = field(default_factory=list)
+    begin: float = field(default_factory=time.process_time)
+
+    def watch(self, event: object) -> None:
+        if isinstance(event, Started):
+            self.tell(rounds_of(self.root))
+
+    def tell(self, done: Sequence[Round]) -> None:
+        for each in done[len(self.figures) :]:
+            now = time.process_time()
+            self.figures.append(round_figures(each, self.values) | {"cpu": now - self.begin})
+            self.begin = now
+            print(self.figures[-1], file=sys.stderr, flush=True)
+
+
+def _characterised(
+    folder: Path, number: int, seconds: float, name: str
+) -> tuple[characterise.Characterisation, list[dict[str, Any]]]:
+    """A rig's characterisation, gone on with where it has begun, and figures of its rounds."""
+    root = folder / "c"
+    told = _Rounds(root, hidden_values(number, name))
+    if root.exists():
+        designed = characterise.resume(root, watch=told.watch)
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        rig = _rig_file(folder, number, hidden_parameters(number))
+        designed = characterise.characterise(rig, seconds, None, root, model=name, watch=told.watch)
+    told.tell(designed.rounds)
+    return designed, told.figures
+
+
+def round_figures(done: Round, values: Mapping[str, float]) -> dict[str, Any]:
+    """What the runs until then have told, beside what the round's design predicted."""
+    intervals = done.intervals()
+    bounded = [i for i in intervals if i.width and i.expected]
+    ratios = [i.width / i.expected for i in bounded if i.width and i.expected]
+    return {
+        "round": done.number,
+        "runs": len(done.experiments),
+        "stopped": sum(done.stops(experiment) for experiment in done.experiments),
+        "bounded": f"{len(bounded)} of {len(intervals)}",
+        "geometric mean": _mean([i.width for i in bounded if i.width]),
+        "widest": max((i.width, i.name) for i in bounded if i.width) if bounded else None,
+        "achieved over predicted": _mean(ratios),
+        "covered": _share_covered(intervals, values),
+    }
+
+
+def _mean(ratios: Sequence[float]) -> float | None:
+    """Geometric mean; None of none."""
+    return float(np.exp(np.mean(np.log(ratios)))) if ratios else None
+
+
+def hidden_values(number: int, name: str) -> dict[str, float]:
+    """What experiments can tell of a rig, by the name of the model that is identified."""
+    model = find_model(name)
+    nominal = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
+    structure, space = identifiability(model, sensors=False), SearchSpace.of(model)
+    truth = nominal | hidden_parameters(number)
+    return {q.text: q.value(truth) for q in determined(structure, space)}
 
 
 def hidden_parameters(number: int) -> dict[str, float]:
@@ -102,11 +176,7 @@ def hidden_parameters(number: int) -> dict[str, float]:
 
 def _share_covered(intervals: Iterable[Interval], truth: Mapping[str, float]) -> float:
     """Share of the intervals with two ends that hold the truth."""
-    held = [
-        abs(truth[i.name] - i.value) <= i.width * abs(i.value)
-        for i in intervals
-        if i.width is not None
-    ]
+    held = [i.holds(truth[i.name]) for i in intervals if i.width is not None]
     return sum(held) / max(len(held), 1)
 
 

@@ -75,7 +75,8 @@ class Interval:
     """A quantity after a round: its value, and half width of its 95 % interval in parts of it.
 
     expected: the half width that the design predicted; None where it is not in the design. width
-    is None where the runs determine no interval.
+    is None where the runs determine no interval with two ends. low, high: the ends, which need not
+    be alike far from the value; None where the runs set none.
     """
 
     name: str
@@ -83,6 +84,13 @@ class Interval:
     value: float
     width: float | None
     expected: float | None
+    low: float | None = None
+    high: float | None = None
+
+    def holds(self, value: float) -> bool:
+        """Whether a value lies within it."""
+        above = self.low is None or value >= self.low
+        return above and (self.high is None or value <= self.high)
 
 
 @dataclass(frozen=True)
@@ -145,7 +153,11 @@ class Round:
         """Whether limits have stopped an experiment so often that nobody has mended why."""
         if self.captures(experiment):
             return False
-        return len(self._ended(experiment, INTERLOCK)) >= _STOPS
+        return self.stops(experiment) >= _STOPS
+
+    def stops(self, experiment: Path) -> int:
+        """How often limits have stopped an experiment."""
+        return len(self._ended(experiment, INTERLOCK))
 
     @property
     def logs(self) -> list[Path]:
@@ -184,7 +196,7 @@ def _interval(quantity: Mapping[str, Any], entry: Mapping[str, Any]) -> Interval
     width = None
     if low is not None and high is not None and value:
         width = 0.5 * abs((high - low) / value)
-    return Interval(quantity["name"], quantity["unit"], value, width, quantity["after"])
+    return Interval(quantity["name"], quantity["unit"], value, width, quantity["after"], low, high)
 
 
 def rounds_of(folder: Path) -> list[Round]:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.config.rig import RigConfig
 from daq.config.yaml_file import YamlFile
@@ -20,6 +21,7 @@ _VOLTS = 0.010  # rms at an analog input, where nothing tells more
 _COUNTS = 1.0 / 6.0  # of the count in a sample, by which a speed errs
 _TIMED = 0.1  # of that, beside what the instants of its edges do
 _REPEATED = 3.0  # samples at most that tell of the same edges while the speed changes
+_NEVER = 1e3  # s, by which a sample may be off that tells of no time
 
 
 def prior_of(space: SearchSpace, file: YamlFile | None) -> Prior:
@@ -45,22 +47,38 @@ def prior_of(space: SearchSpace, file: YamlFile | None) -> Prior:
         changes = np.zeros((len(rows), n_free))
         changes[:, places] = rows
         changes /= np.where(space.log, values, 1.0)
-    return Prior(values, _together(ranges.covariance, changes, places))
+    entries = file.content["parameters"]
+    tied = [
+        place
+        for place, name in zip(places, names, strict=True)
+        if isinstance(entries[name], dict) and entries[name].get("undetermined") == "tied"
+    ]
+    return _together(space, ranges, Prior(values, changes.T @ changes), places, tied)
 
 
-def _together(ranges: FloatArray, changes: FloatArray, places: list[int]) -> FloatArray:
-    """Covariance of coordinates known by their ranges and by a result's independent changes.
+def _together(
+    space: SearchSpace, ranges: Prior, result: Prior, places: list[int], tied: list[int]
+) -> Prior:
+    """What ranges and a result say together: their normal distributions' product.
 
-    changes: (n, n_free), of one standard deviation each; places: the coordinates that it knows.
+    places: the coordinates that the result knows. tied: those of what acts only with others, whose
+    values stay: any are as good, and a straight way to others does not keep sums of them.
     """
     block = np.ix_(places, places)
-    covariance = (changes.T @ changes)[block]
+    covariance = result.covariance[block]
     # What no change moves has been told exactly, as far as numbers go.
     least = 1e-9 * np.eye(len(places)) * max(float(np.trace(covariance)), 1e-12)
-    information = np.linalg.inv(ranges)
+    of_ranges = ranges.information()
+    information = of_ranges.copy()
     information[block] += np.linalg.inv(covariance + least)
-    together: FloatArray = np.linalg.inv(information)
-    return 0.5 * (together + together.T)
+    together = np.linalg.inv(information)
+    together = 0.5 * (together + together.T)
+    away = space.encode(ranges.values) - space.encode(result.values)
+    offset = together @ of_ranges @ away
+    offset[tied] = 0.0
+    moved = space.decode(space.encode(result.values) + offset)
+    values = np.clip(moved, space.lower, space.upper)
+    return Prior(values if space.feasible(values) else result.values, together)
 
 
 def noise_of(
@@ -113,16 +131,29 @@ def speed_noise(rig: RigConfig, sample_rate: float) -> float:
 def expected_jitter(omega: FloatArray, dt: float, count: float) -> FloatArray:
     """Standard deviations of when speeds were measured that are timed from edge to edge [s].
 
-    As ``daq.logs.encoder.mean_speeds`` finds them in a log on average. omega: (n,) [rad/s]; count:
-    angle of one [rad].
+    As ``daq.logs.encoder.mean_speeds`` finds them in a log on average; where it finds no speed, so
+    long that the sample tells nothing. omega: (n,) [rad/s]; count: angle of one [rad].
 
-    >>> (1e3 * expected_jitter(np.array([0.1, 1.0, 10.0]), 1e-3, 1e-3)).round(4).tolist()
-    [0.5, 0.2887, 0.0289]
+    >>> (1e3 * expected_jitter(np.array([0.1, 1.0, 10.0, 1.0]), 1e-3, 1e-3)).round(4).tolist()
+    [0.5, 0.2887, 0.0289, 0.2887]
     """
     length = count / np.maximum(np.abs(omega) * dt, 1e-3 * count)  # samples between edges
     slack = np.minimum(length, 1.0) / math.sqrt(12.0)
-    jitter: FloatArray = dt * slack * np.sqrt(np.clip(length, 1.0, _REPEATED))
-    return jitter
+    jitter = dt * slack * np.sqrt(np.clip(length, 1.0, _REPEATED))
+    return np.where(_between_turns(omega * (dt / count)), _NEVER, jitter)
+
+
+def _between_turns(rate: FloatArray) -> npt.NDArray[np.bool_]:
+    """At which samples the last edges are such between which the shaft turned round repeatedly.
+
+    rate: (n,), in counts a sample.
+    """
+    steps = np.diff(np.floor(np.cumsum(rate)), prepend=0.0)
+    rows = np.flatnonzero(steps)
+    turned = np.zeros(len(rows) + 1, dtype=bool)
+    turned[1:-1] = steps[rows[1:]] * steps[rows[:-1]] < 0.0
+    repeated = turned & (np.roll(turned, 1) | np.roll(turned, -1))
+    return repeated[np.searchsorted(rows, np.arange(len(rate)))]
 
 
 def require_calibrated(path: Path, log: Recording) -> None:

@@ -35,6 +35,7 @@ _ALIKE = 0.05  # rivals closer than this are one
 _SIDES = (-1.0, 1.0)
 _ROUNDS = 3  # of searches that go on from what others came to
 _FAR = 0.1  # of the way to an end, by which such a place is beyond it
+_LEAST = 1e-12  # variance, and share of others', of what a covariance holds for known exactly
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ def uncertainty(
         analysis.covariance.rank,
         tuple(rival for rival in minima if any(e.excludes(rival.values) for e in apart)),
         disagreement=spread.disagreement if spread else 1.0,
-        factor=analysis.factor(),
+        factor=analysis.factor(others),
         succession=_succession(local),
         bent=_bent(local),
     )
@@ -248,11 +249,52 @@ class _Analysis:
         if self.pushed.any():
             self.covariance = covariance(local, structure.directions, self.pushed)
         self.gradients: dict[str, FloatArray] = {}
+        self.combined: dict[str, Invariant] = {}
+        self.alike: list[FloatArray] = []
 
-    def factor(self) -> FloatArray:
+    def factor(self, rivals: Sequence[FloatArray]) -> FloatArray:
         """As of ``Uncertainty``."""
-        matrix, increments = self.covariance.matrix, self.local.increments
+        points = [*self.alike, *map(self.space.encode, rivals)]
+        matrix, increments = self._no_narrower(points), self.local.increments
         return covariance_factor(matrix, self.ties.directions, increments)
+
+    def _no_narrower(self, points: Sequence[FloatArray]) -> FloatArray:
+        """Covariance (n_free, n_free) of whose 95 % no point that explains the data is outside.
+
+        points: search coordinates (n_free,). Slopes at the estimate tell nothing of the valley
+        beyond where it bends or ends; it is widened along the way to each of the points, least.
+        """
+        matrix = self.covariance.matrix
+        rows = np.reshape([*self.gradients.values()], (len(self.gradients), len(self.coded)))
+        back = np.linalg.pinv(rows)  # of what moves with nothing but ties the least
+        changes = [self._changes(point) for point in points]
+        while changes:
+            known = rows @ matrix @ rows.T
+            size = np.sqrt(np.maximum(np.diag(known), _LEAST))
+            precision = np.linalg.pinv(
+                known / np.outer(size, size) + _LEAST * np.eye(len(size)), hermitian=True
+            )
+            far = [float(c / size @ precision @ (c / size)) for c in changes]
+            place = int(np.argmax(far))
+            if far[place] <= Z95**2:
+                break
+            along = back @ changes.pop(place)
+            matrix = matrix + np.outer(along, along) * (1.0 / Z95**2 - 1.0 / far[place])
+        return matrix
+
+    def _changes(self, point: FloatArray) -> FloatArray:
+        """How far quantities are at search coordinates from the estimate, in parts of slopes."""
+        there, changes = named_values(self.space, self.space.decode(point)), []
+        for name in self.gradients:
+            combination = self.combined.get(name)
+            if combination is None:
+                place = self.space.names.index(name)
+                changes.append(point[place] - self.coded[place])
+                continue
+            value, here = combination.value(there), combination.value(self.named)
+            positive = min(value, here) > 0.0
+            changes.append(here * np.log(value / here) if positive else value - here)
+        return np.array(changes)
 
     def parameter(self, j: int) -> _Draft:
         """Estimate of a free parameter."""
@@ -384,7 +426,7 @@ class _Analysis:
         text, value = combination.text, float(combination.value(self.named))
         estimate = Estimate(text, combination.unit, value, combination=combination)
         gradient = free_gradient(combination, self.space, self.named) * self.local.increments
-        self.gradients[text] = gradient
+        self.gradients[text], self.combined[text] = gradient, combination
         deviation = self.covariance.deviation(gradient)
         positive = bool(np.all(self.space.log[gradient != 0.0])) and value > 0.0
         moved = gradient / value if positive else gradient
@@ -420,6 +462,7 @@ class _Analysis:
             ends = traced([(t, t.bound(sign, begin)) for _, t, sign, begin in searches], fits)
             for (k, _, sign, _), end in zip(searches, ends, strict=True):
                 drafts[k] = drafts[k].with_end(sign, end)
+        self.alike = [fit.at for fit in fits if fit.statistic <= Z95**2]
         return [self._profiled(draft, fits) if draft.traced else draft.estimate for draft in drafts]
 
     def _profiled(self, draft: _Draft, fits: Sequence[Fit]) -> Estimate:

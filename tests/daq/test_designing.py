@@ -119,7 +119,7 @@ def test_a_run_at_the_end_of_a_supply_takes_the_steps_that_it_needs():
     assert records is not None
 
 
-@pytest.mark.parametrize(("frequency", "passes"), [(100.0, False), (4.0, True)])
+@pytest.mark.parametrize(("frequency", "passes"), [(200.0, False), (4.0, True)])
 def test_a_shaft_that_turns_round_every_few_samples_tells_edges_no_speed(frequency, passes):
     config, device = load_rig("simulated.yaml")
     model, noise = actuator(parameters="rig"), {"current_motor": 0.005, "omega": 0.1}
@@ -210,8 +210,26 @@ def test_prior_from_a_result_has_its_deviations(tmp_path):
     setup = set_up(TypedSettings.of({"config": files["id"], "parameters": files["result"]}))
     exact = np.array(factor).T @ np.array(factor) / np.outer([*value.values()], [*value.values()])
     order = [setup.space.names.index(name) for name in value]
-    assert setup.prior.values[order] == pytest.approx([*value.values()])
+    assert setup.prior.values[order] == pytest.approx([*value.values()], rel=1e-3)
     assert setup.prior.covariance[np.ix_(order, order)] == pytest.approx(exact, rel=0.02)
+
+
+def test_of_what_a_result_hardly_tells_ranges_decide_as_much(tmp_path):
+    write_yaml(tmp_path / "id.yaml", few_free())
+    files = {name: str(tmp_path / f"{name}.yaml") for name in ("id", "result")}
+    ranges = set_up(TypedSettings.of({"config": files["id"]}))
+    place = ranges.space.names.index("R_m")
+    nominal, deviation = ranges.prior.values[place], ranges.prior.covariance[place, place] ** 0.5
+    value = 1.5 * float(nominal)
+    result = {
+        "parameters": {"R_m": {"value": value, "unit": "ohm"}},
+        "covariance": {"parameters": ["R_m"], "factor": [[value * float(deviation)]]},
+    }
+    (tmp_path / "result.yaml").write_text(yaml.safe_dump(result))
+    setup = set_up(TypedSettings.of({"config": files["id"], "parameters": files["result"]}))
+    # As far from either as from the other, and half of the variance.
+    assert setup.prior.values[place] == pytest.approx(np.sqrt(nominal * value), rel=1e-6)
+    assert setup.prior.covariance[place, place] == pytest.approx(0.5 * deviation**2, rel=1e-6)
 
 
 @pytest.mark.parametrize(

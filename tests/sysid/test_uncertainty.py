@@ -653,9 +653,13 @@ def test_a_valley_that_turns_back_is_followed_behind_its_turn(seed, begun):
     """b = k (1.4 - k) has two values of k for each below 0.49, and ends of its range at both."""
     objective = feedback(0.004, seed).objective()
     end = refine(objective, np.array(begun), max_iterations=300)
-    b = estimates(uncertainty(objective, end.chromosome))["b"]
+    result = uncertainty(objective, end.chromosome)
+    b = estimates(result)["b"]
     assert (b.low, b.std) == (None, None)
     assert b.high == pytest.approx(0.49, rel=0.03)
+    deviation = np.linalg.norm(result.factor[:, 1]) / b.value
+    # A later stage is told of the whole way to where its range ends.
+    assert Z * deviation > 0.95 * np.log(b.value / 0.04)
 
 
 @pytest.mark.parametrize("begun", [(0.3, 0.33), (0.15, 0.2)])
@@ -731,6 +735,8 @@ def test_what_does_nothing_is_hardly_felt():
     parameters = estimates(result)
     assert parameters["idle"].why == "vague" and not result.ambiguities
     same_interval(parameters["a"], estimates(problem.tell(fixed={"idle": 1.0}))["a"])
+    of_each = np.linalg.norm(result.factor, axis=0)
+    assert of_each == pytest.approx([parameters["a"].std, np.log(10.0) / Z], rel=1e-3)
 
 
 def small_effect(p, u):
