@@ -176,7 +176,11 @@ def hidden_parameters(number: int) -> dict[str, float]:
 
 def _share_covered(intervals: Iterable[Interval], truth: Mapping[str, float]) -> float:
     """Share of the intervals with two ends that hold the truth."""
-    held = [i.holds(truth[i.name]) for i in intervals if i.width is not None]
+    held = [
+        i.low <= truth[i.name] <= i.high
+        for i in intervals
+        if i.low is not None and i.high is not None
+    ]
     return sum(held) / max(len(held), 1)
 
 

@@ -87,11 +87,6 @@ class Interval:
     low: float | None = None
     high: float | None = None
 
-    def holds(self, value: float) -> bool:
-        """Whether a value lies within it."""
-        above = self.low is None or value >= self.low
-        return above and (self.high is None or value <= self.high)
-
 
 @dataclass(frozen=True)
 class Round:

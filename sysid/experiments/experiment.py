@@ -201,13 +201,14 @@ def design(
         return gained if np.isfinite(gained).all() else None
 
     def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
-        gained = expected(informant, excitation, genes)
-        if gained is None:
-            return None
-        if not all(map(tells_nothing_there, gained, null)):
-            phantoms.append(excitation.name)
-            return None
-        return RunCandidate(excitation, genes, gained)
+        for by in (informant, exact):  # where coarser steps err, finer ones need not
+            gained = expected(by, excitation, genes)
+            if gained is None:
+                return None
+            if all(map(tells_nothing_there, gained, null)):
+                return RunCandidate(excitation, genes, gained)
+        phantoms.append(excitation.name)
+        return None
 
     def settled(candidate: RunCandidate) -> RunCandidate:
         gained = expected(exact, candidate.excitation, candidate.genes)

@@ -62,6 +62,8 @@ def test_the_intervals_hold_what_the_simulated_rig_is_made_of(finished):
     for name, quantity in determined.items():
         off = abs(1.0 - truth[name] / quantity["value"])
         assert off <= 1.5 * quantity["width"]  # three standard deviations
+        half = 0.5 * (quantity["high"] - quantity["low"])
+        assert half == pytest.approx(quantity["width"] * quantity["value"])
     # 1.5 s and a calibration of 40 samples tell little of 2 mN m of bearings.
     assert all(determined[name]["width"] < 0.1 for name in ("R_m", "K_m"))
 
