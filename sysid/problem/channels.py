@@ -16,6 +16,7 @@ _RESTING = 1e-3  # of its span: how near 0 a level is that of rest
 _HARMLESS = 1e-4  # of a channel's variance
 _NEARBY = 8  # samples on either side, among which one stands out
 _SOME, _BRIEF = 4, 32  # samples of a burst
+_SHORT, _LONGER = 1.0, 2.0  # samples, and times a mean's own, of means that foretell it
 MEDIAN_OF_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
 
 
@@ -152,16 +153,17 @@ def resolution(values: FloatArray) -> float:
     return float(gaps.min()) if len(gaps) else 0.0
 
 
-def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
+def spikes(values: FloatArray, inputs: FloatArray, averaged: FloatArray) -> Spikes | None:
     """Single samples that leave their neighbours and return, too far for noise, or a sharp corner.
 
     And short bursts of such, to and fro, beyond all that the channel does elsewhere. None where all
     together they are below a per cent of the channel's own deviation.
-    inputs: (n, n_inputs), whose jumps answer for pulses that follow them.
+    inputs: (n, n_inputs), whose jumps answer for pulses that follow them. averaged: (n,), samples
+    over which each is a mean: one of many tells nothing of what a shorter one beside it may be.
 
     >>> quiet = 0.01 * np.random.default_rng(0).standard_normal(400)
     >>> jolted = quiet + np.isin(np.arange(400), [30, 90, 300])
-    >>> spikes(jolted, np.zeros((400, 1))).at.nonzero()[0].tolist()
+    >>> spikes(jolted, np.zeros((400, 1)), np.zeros(400)).at.nonzero()[0].tolist()
     [30, 90, 300]
     """
     n = len(values)
@@ -192,6 +194,8 @@ def spikes(values: FloatArray, inputs: FloatArray) -> Spikes | None:
         at[1:-1] = returned & (np.abs(away) > 7.0 * usual) & (usual > 0.0)
     # A shaft that slips out of its rest for a sample.
     at[1:-1] &= (before != 0.0) | (after != 0.0)
+    around_it = np.maximum(averaged[:-2], averaged[2:])
+    at[1:-1] &= around_it <= np.maximum(_SHORT, _LONGER * averaged[1:-1])
     jolted = _after_jumps(inputs)
     reactions = np.abs(away)[jolted[1:-1] & np.isfinite(away)]
     if len(reactions):

@@ -114,8 +114,9 @@ def mended(model: ProcessModel, record: Dataset) -> Dataset:
     array([50])
     """
     inputs, outputs = record.inputs.copy(), record.outputs.copy()
-    for column in outputs.T:
-        jolts, hang = spikes(column, record.inputs), standstill(column, record.inputs)
+    for j, column in enumerate(outputs.T):
+        jolts = spikes(column, record.inputs, _averaged(record, j))
+        hang = standstill(column, record.inputs)
         tests = (jolts, hang, *pile_ups(column))
         wrong = np.zeros(len(column), dtype=np.bool_)
         for test in tests:
@@ -123,7 +124,7 @@ def mended(model: ProcessModel, record: Dataset) -> Dataset:
         column[1:][wrong[1:]] = np.nan
     rows = np.arange(record.n_samples)
     for j, column in enumerate(inputs.T):
-        jolts = spikes(column, np.delete(record.inputs, j, axis=1))
+        jolts = spikes(column, np.delete(record.inputs, j, axis=1), np.zeros(len(column)))
         if jolts is not None and _role(model, record, j) != "command":
             good = ~jolts.at
             column[:] = np.interp(rows, rows[good], column[good])
@@ -165,10 +166,20 @@ def _in_record(model: ProcessModel, record: Dataset, part: Part) -> Iterator[Dat
     yield from _gaps(record, part)
     for j, u in enumerate(model.inputs):
         role, others = _role(model, record, j), np.delete(record.inputs, j, axis=1)
-        yield from _Channel(record, part, u, record.inputs[:, j], role, others).faults()
+        plain = np.zeros(record.n_samples)
+        yield from _Channel(record, part, u, record.inputs[:, j], role, others, plain).faults()
     for j, y in enumerate(model.outputs):
         values, inputs = record.outputs[:, j], record.inputs
-        yield from _Channel(record, part, y, values, "sensor", inputs).faults()
+        averaged = _averaged(record, j)
+        yield from _Channel(record, part, y, values, "sensor", inputs, averaged).faults()
+
+
+def _averaged(record: Dataset, output: int) -> FloatArray:
+    """Samples over which each value of an output is a mean, (n_samples,)."""
+    if not record.windows.size:
+        return np.zeros(record.n_samples)
+    lengths: FloatArray = np.ptp(record.windows[:, output], axis=1) / record.dt
+    return lengths
 
 
 def _role(model: ProcessModel, record: Dataset, place: int) -> Role:
@@ -182,7 +193,8 @@ def _role(model: ProcessModel, record: Dataset, place: int) -> Role:
 class _Channel:
     """A channel of a record; role: whether it is a command, a sensor, or an input that is either.
 
-    What a command does is meant. inputs: (n, n_inputs), those that may drive it.
+    What a command does is meant. inputs: (n, n_inputs), those that may drive it. averaged: (n,),
+    samples over which each is a mean.
     """
 
     record: Dataset
@@ -191,6 +203,7 @@ class _Channel:
     values: FloatArray
     role: Role
     inputs: FloatArray
+    averaged: FloatArray
 
     @property
     def name(self) -> str:
@@ -252,7 +265,7 @@ class _Channel:
         yield self._fault("frozen", "doubt", statement, effect, cure, float(hang.at.mean()))
 
     def _outliers(self) -> Iterator[DataFault]:
-        jolts = spikes(self.values, self.inputs)
+        jolts = spikes(self.values, self.inputs, self.averaged)
         if jolts is None or (self.role == "command" and jolts.size < _GROSS * self.values.std()):
             return
         count = int(jolts.at.sum())

@@ -267,7 +267,7 @@ class _Analysis:
         matrix = self.covariance.matrix
         rows = np.reshape([*self.gradients.values()], (len(self.gradients), len(self.coded)))
         back = np.linalg.pinv(rows)  # of what moves with nothing but ties the least
-        changes = [self._changes(point) for point in points]
+        changes = [c for c in map(self._changes, points) if np.isfinite(c).all()]
         while changes:
             known = rows @ matrix @ rows.T
             size = np.sqrt(np.maximum(np.diag(known), _LEAST))

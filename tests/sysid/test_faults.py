@@ -318,6 +318,19 @@ def test_outliers_of_a_measured_input_are_named_and_mended():
     assert (note.severity, note.moves_parameters) == ("note", False)
 
 
+def test_a_short_mean_between_long_ones_is_no_outlier():
+    """As of a shaft that slips: four samples repeat the mean from one slow edge to the next."""
+    ends = np.cumsum(np.tile([4, 4, 4, 1], N // 13 + 1))
+    place = np.searchsorted(ends, np.arange(N))
+    rng = np.random.default_rng(0)
+    means = 0.15 + 0.005 * rng.standard_normal(len(ends)) + 0.4 * (np.arange(len(ends)) % 32 == 3)
+    record = replace(driven(levels()), outputs=means[place][:, None])
+    edges = np.stack([np.append(0, ends)[place], ends[place]], axis=1) - np.arange(N)[:, None]
+    averaged = replace(record, windows=DT * edges[:, None])
+    assert any(fault.kind == "outliers" for fault in data_faults(model(), [record]))
+    assert not any(fault.kind == "outliers" for fault in data_faults(model(), [averaged]))
+
+
 def test_a_plant_that_settles_until_the_next_step_does_not_hang():
     u = np.repeat([0.0, 1.0, -1.0, 0.5], [100, 200, 300, 400]) + 0.3 * (TIME < 1.0) * wave(37)
     settled = driven(u, noise=0.0, tau=0.002)
