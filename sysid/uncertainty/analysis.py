@@ -269,10 +269,10 @@ class _Analysis:
         back = np.linalg.pinv(rows)  # of what moves with nothing but ties the least
         changes = [c for c in map(self._changes, points) if np.isfinite(c).all()]
         while changes:
-            known = rows @ matrix @ rows.T
-            size = np.sqrt(np.maximum(np.diag(known), _LEAST))
+            joint = rows @ matrix @ rows.T
+            size = np.sqrt(np.maximum(np.diag(joint), _LEAST))
             precision = np.linalg.pinv(
-                known / np.outer(size, size) + _LEAST * np.eye(len(size)), hermitian=True
+                joint / np.outer(size, size) + _LEAST * np.eye(len(size)), hermitian=True
             )
             far = [float(c / size @ precision @ (c / size)) for c in changes]
             place = int(np.argmax(far))
