@@ -65,20 +65,19 @@ def _together(
     values stay: any are as good, and a straight way to others does not keep sums of them.
     """
     block = np.ix_(places, places)
-    covariance = result.covariance[block]
-    # What no change moves has been told exactly, as far as numbers go.
-    least = 1e-9 * np.eye(len(places)) * max(float(np.trace(covariance)), 1e-12)
-    of_ranges = ranges.information()
-    information = of_ranges.copy()
-    information[block] += np.linalg.inv(covariance + least)
-    together = np.linalg.inv(information)
-    together = 0.5 * (together + together.T)
+    widths, of_result = ranges.covariance[block], result.covariance[block]
+    # Neither is inverted: what no change moves has been told exactly, other things hardly at all.
+    share = np.linalg.solve(widths + of_result, of_result).T
+    covariance = ranges.covariance.copy()
+    covariance[block] = share @ widths
+    covariance = 0.5 * (covariance + covariance.T)
     away = space.encode(ranges.values) - space.encode(result.values)
-    offset = together @ of_ranges @ away
+    offset = np.zeros(len(away))
+    offset[places] = share @ away[places]
     offset[tied] = 0.0
     moved = space.decode(space.encode(result.values) + offset)
     values = np.clip(moved, space.lower, space.upper)
-    return Prior(values if space.feasible(values) else result.values, together)
+    return Prior(values if space.feasible(values) else result.values, covariance)
 
 
 def noise_of(

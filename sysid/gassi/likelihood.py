@@ -365,7 +365,8 @@ def _weighed(
         objective = weighed
         end = refine(objective, chromosome, tolerance=tolerance, on_iteration=watch)
         chromosome, rms = end.chromosome, end.rms
-        if steady and end.iterations < MOST_ITERATIONS:  # along bent valleys it takes more
+        settled = steady and end.iterations < MOST_ITERATIONS  # along bent valleys it takes more
+        if settled or not np.isfinite(rms).all():
             break
     return _optimum(objective, chromosome, rms)
 
@@ -583,6 +584,8 @@ def noisy_fit(
         if not corrects and fitted.overwhelmed.any():
             return None
         rms = fitted.rms(chromosome[None])[0]
+        if not np.isfinite(rms).all():  # a filter needs more steps here than there may be
+            break
         weighed = fitted.weighed(objective.weights / (too_well * np.maximum(rms, _TINY)))
         steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
         end = refine(weighed, chromosome, on_iteration=watch)

@@ -7,7 +7,7 @@ likelihood, which may end on one side only.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
@@ -161,7 +161,9 @@ def uncertainty(
         analysis.covariance.rank,
         tuple(rival for rival in minima if any(e.excludes(rival.values) for e in apart)),
         disagreement=spread.disagreement if spread else 1.0,
-        factor=analysis.factor(others),
+        factor=analysis.factor(
+            others, itertools.chain(parameters, *(a.determined for a in ambiguities))
+        ),
         succession=_succession(local),
         bent=_bent(local),
     )
@@ -252,22 +254,34 @@ class _Analysis:
         self.combined: dict[str, Invariant] = {}
         self.alike: list[FloatArray] = []
 
-    def factor(self, rivals: Sequence[FloatArray]) -> FloatArray:
+    def factor(self, rivals: Sequence[FloatArray], estimates: Iterable[Estimate]) -> FloatArray:
         """As of ``Uncertainty``."""
         points = [*self.alike, *map(self.space.encode, rivals)]
-        matrix, increments = self._no_narrower(points), self.local.increments
-        return covariance_factor(matrix, self.ties.directions, increments)
+        profiled = [e for e in estimates if e.name in self.gradients and (e.std is None or e.why)]
+        matrix = self._as_wide_as(points, profiled)
+        return covariance_factor(matrix, self.ties.directions, self.local.increments)
 
-    def _no_narrower(self, points: Sequence[FloatArray]) -> FloatArray:
-        """Covariance (n_free, n_free) of whose 95 % no point that explains the data is outside.
+    def _as_wide_as(self, points: Sequence[FloatArray], profiled: Sequence[Estimate]) -> FloatArray:
+        """Covariance (n_free, n_free) that reaches as far as profiles do, neither less nor more.
 
-        points: search coordinates (n_free,). Slopes at the estimate tell nothing of the valley
-        beyond where it bends or ends; it is widened along the way to each of the points, least.
+        points: search coordinates (n_free,) that explain the data. profiled: quantities of which
+        slopes at the estimate tell nothing, as of a valley beyond where it bends or ends. Where
+        slopes hardly feel one they reach beyond its interval: all else is kept as it is at each of
+        its values. Where they feel one that is not known, they are widened along the way to each
+        point by the least that does. Others stay as well known as they are.
         """
         matrix = self.covariance.matrix
+        for estimate in profiled:
+            gradient, widest = self.gradients[estimate.name], self._widest(estimate)
+            along = matrix @ gradient
+            variance = float(gradient @ along)
+            if variance > widest**2:
+                change = (widest**2 / variance - 1.0) / variance
+                matrix = matrix + np.outer(along, along) * change
         rows = np.reshape([*self.gradients.values()], (len(self.gradients), len(self.coded)))
         back = np.linalg.pinv(rows)  # of what moves with nothing but ties the least
-        changes = [c for c in map(self._changes, points) if np.isfinite(c).all()]
+        moving = np.isin([*self.gradients], [estimate.name for estimate in profiled])
+        changes = [moving * c for c in map(self._changes, points) if np.isfinite(c).all()]
         while changes:
             joint = rows @ matrix @ rows.T
             size = np.sqrt(np.maximum(np.diag(joint), _LEAST))
@@ -281,6 +295,24 @@ class _Analysis:
             along = back @ changes.pop(place)
             matrix = matrix + np.outer(along, along) * (1.0 / Z95**2 - 1.0 / far[place])
         return matrix
+
+    def _widest(self, estimate: Estimate) -> float:
+        """Deviation of which the farther end of an interval is one of 95 %, in parts of slopes.
+
+        Of a parameter that has no end there to that of its range; infinite of a combination.
+        """
+        ends = estimate.low, estimate.high
+        if estimate.combination is None:
+            place = self.space.names.index(estimate.name)
+            bounds = [float(bound[place]) for bound in self.space.coded_bounds]
+            at = float(self.coded[place])
+            there = [
+                bound if end is None else float(np.log(end)) if self.space.log[place] else end
+                for end, bound in zip(ends, bounds, strict=True)
+            ]
+            return max(abs(end - at) for end in there) / Z95
+        distances = [abs(end - estimate.value) for end in ends if end is not None]
+        return max(distances) / Z95 if len(distances) == len(ends) else float("inf")
 
     def _changes(self, point: FloatArray) -> FloatArray:
         """How far quantities are at search coordinates from the estimate, in parts of slopes."""

@@ -751,8 +751,12 @@ def test_a_weak_parameter_has_the_ends_that_its_slope_gives(seed):
     X, y = problem.records[0].inputs * [1.0, 1e-2], problem.records[0].outputs[:, 0]
     best = np.linalg.lstsq(X, y, rcond=None)[0]
     half = Z * np.std(y - X @ best) * np.sqrt(np.linalg.inv(X.T @ X)[1, 1])
-    b = estimates(problem.tell())["b"]
+    result = problem.tell()
+    b = estimates(result)["b"]
     assert (b.std, b.why) == (None, "")
+    farther = max(np.log((b.high or 2.0) / b.value), np.log(b.value / (b.low or 0.02)))
+    passed_on = np.linalg.norm(result.factor[:, 1]) / b.value
+    assert Z * passed_on == pytest.approx(farther, rel=0.1)
     expected = [None if not 0.02 < end < 2.0 else end for end in (best[1] - half, best[1] + half)]
     assert [b.low, b.high] == [end if end is None else pytest.approx(end, rel=0.05)
                                for end in expected]  # fmt: skip
