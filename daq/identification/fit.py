@@ -154,6 +154,9 @@ def fit(
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     try:
         estimator = _searched(problem, train, folder, watch, resume)
+        problem = problem.starting(estimator.estimated_starts_)
+        for name in estimator.estimated_starts_:
+            watch(Note("note", _STARTED.format(name)))
         result = assemble(problem, estimator, logs, folder, watch, faults)
         if examine(result):
             result = examined(result, logs, watch)
@@ -167,6 +170,12 @@ def fit(
         if not result.interrupted:
             request.forget(folder)
     return result
+
+
+_STARTED = (
+    "where {0} starts is estimated: the noise of its first sample would move parameters "
+    "(initial.{0}=first starts there all the same)"
+)
 
 
 def _require_information(problem: Problem, train: Sequence[LoggedRecord]) -> None:

@@ -2,11 +2,11 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, Self, TypeVar, get_args
 
 from daq.config import check, yaml_file
 from daq.config.identification import IdentificationConfig, Signals, TermSetting
@@ -22,6 +22,7 @@ from daq.lookup.models import DEFAULT_MODEL, find_model, whole_name
 from daq.progress import Note, Watch, ignore
 from sysid import Given, ModelError, ProcessModel, SearchSpace
 from sysid.problem.corrections import Correction, Kind, with_corrections
+from sysid.problem.model import InitialValue
 from sysid.problem.terms import AddedTerm, with_terms
 
 File = TypeVar("File", bound=YamlFile)
@@ -62,6 +63,20 @@ class Problem:
         """Of what was typed as ``key=value`` all that says how logs are read."""
         keys = ("columns", *KEYS)
         return [s for s in self.request.settings if re.split(r"[.=]", s)[0].strip() in keys]
+
+    def starting(self, estimated: Collection[str]) -> Self:
+        """The same with starts of states estimated, as if that had been asked for."""
+        if not estimated:
+            return self
+        starts: dict[str, InitialValue] = dict.fromkeys(estimated, "estimate")
+        settings = self.settings.model_copy(update={"initial": {**self.settings.initial, **starts}})
+        words = [*self.request.settings, *(f"initial.{name}=estimate" for name in estimated)]
+        return dataclasses.replace(
+            self,
+            model=self.model.with_initial(starts),
+            settings=settings,
+            request=dataclasses.replace(self.request, settings=words),
+        )
 
 
 def problem_of(
@@ -280,6 +295,7 @@ def gassi_settings(problem: Problem) -> dict[str, Any]:
     names = (*search, *simulation, *space, *error)
     arguments = {name: getattr(settings, name) for name in names}
     arguments |= {"given": problem.given, "random_state": settings.seed}
+    arguments["first_samples"] = tuple(k for k, v in settings.initial.items() if v == "first")
     optional = {"weights": settings.weights, "process_noise": settings.process_noise}
     return {**arguments, **{name: value or None for name, value in optional.items()}}
 

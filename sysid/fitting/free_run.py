@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import FloatArray, IntArray
 from sysid.engine.simulation import BatchSimulator
+from sysid.fitting.moves import moved_by
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.problem.data import Dataset
@@ -11,6 +12,8 @@ from sysid.problem.space import SearchSpace
 
 # Factor to the next accuracy where the errors of single steps add up, and the last accuracy.
 FINER, FINEST = 0.1, 1e-9
+_PART = 0.5  # of a deviation by which errors of the steps may move any quantity
+_FAR_MORE = 16  # times the steps that a search took, above which they would cost too much
 
 
 def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
@@ -43,6 +46,37 @@ def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> 
         if not np.max(error / size) > accuracy or simulator.accuracy < FINEST:
             return outputs
         simulator = simulator.finer(FINER * simulator.accuracy)
+
+
+def resolved(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Objective:
+    """The objective by as many steps as noise lets it tell, at a minimum (n_free,).
+
+    rms: (n_outputs,), of the errors there, none of which is zero. Errors of the steps that a
+    search goes by are small beside an output, but may be large beside its noise, as of an encoder.
+    """
+    accurate, at = objective, chromosome[None]
+    first = last = objective.steps_needed(at)
+    changed = True
+    while accurate.simulator.accuracy > FINEST and last.max() < _FAR_MORE * first.max():
+        if changed and not _swayed(accurate, chromosome, last, rms):
+            return accurate
+        accurate = accurate.finer(FINER * accurate.simulator.accuracy)
+        steps = accurate.steps_needed(at)
+        changed, last = bool(np.any(steps != last)), steps
+    return accurate
+
+
+def _swayed(objective: Objective, chromosome: FloatArray, steps: IntArray, rms: FloatArray) -> bool:
+    """Whether errors of so many steps (1, n_records) move a quantity noticeably."""
+
+    def in_noise(chromosomes: FloatArray, times: int = 1) -> FloatArray:
+        taken = np.repeat(times * steps, len(chromosomes), axis=0)
+        return objective.residuals(chromosomes, taken).values / rms[:, None]
+
+    change = (in_noise(chromosome[None]) - in_noise(chromosome[None], 2))[..., 0]
+    if not np.linalg.norm(change) > _PART:
+        return False
+    return moved_by(change, in_noise, objective.space, chromosome) > _PART
 
 
 def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:

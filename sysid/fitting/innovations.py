@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from math import comb
 from typing import Any, Self
 
@@ -37,6 +38,7 @@ from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.simulation import BatchResult, Residuals, Status
 from sysid.fitting.averages import coloured, denoised
 from sysid.fitting.means import each_mean_once, scatter
+from sysid.fitting.moves import moved_by
 from sysid.fitting.objective import Objective
 from sysid.fitting.reactions import with_reactions
 from sysid.problem.channels import MEDIAN_OF_NORMAL
@@ -61,9 +63,8 @@ _DRAWS, _BENT = 8, 0.1
 # Integration steps of a free run that one of a filter may stand for, and by how many deviations of
 # any quantity the difference may move it where an answer is at stake.
 _COARSER, _MOVING = (3.0, 2.0, 1.0, 0.5, 0.25), 0.2
-# Deviations by which parabolas for averaged outputs may move any quantity: intervals count it. And
-# changes of search coordinates, in parts of their ranges, that tell slopes in spite of small kinks.
-_OFF, _MOVE = 1.5, 1e-3
+# Deviations by which parabolas for averaged outputs may move any quantity: intervals count it.
+_OFF = 1.5
 _FEWEST = 2  # a sample, where a free run takes more
 _PART = 0.5  # of a deviation that steps of a free run may move any quantity by
 _MANY = 32  # a sample, with which no covariance bursts
@@ -207,24 +208,19 @@ class Innovations(Objective):
         """
         if not np.linalg.norm(change) > _OFF:
             return 0.0
-        lower, upper = self.space.coded_bounds
-        at = self.space.encode(chromosome)
-        inwards = np.where(at < 0.5 * (lower + upper), _MOVE, -_MOVE) * (upper - lower)
-        moved = self.space.decode(np.vstack([at, at + np.diag(inwards)]))
-        steps = np.repeat(self.steps_needed(chromosome[None]), len(moved), axis=0)
-        values = self._simulated(moved, steps, balanced=False).values
-        slopes = (values[..., 1:] - values[..., :1]) / self._noise_of_each()[..., None]
-        slopes = slopes.reshape(-1, len(chromosome))
-        lengths = np.linalg.norm(slopes, axis=0)
-        felt = np.isfinite(lengths) & (lengths > 0.0)
-        directions, _ = np.linalg.qr(slopes[:, felt] / lengths[felt])
-        return float(np.linalg.norm(directions.T @ change.ravel()))
+        steps = self.steps_needed(chromosome[None])
+        return moved_by(change, partial(self._each_in_noise, steps), self.space, chromosome)
 
     def _in_noise(self, chromosome: FloatArray) -> FloatArray:
         """Innovations (n_residuals, n_outputs) at (n_free,) in parts of the outputs' noise."""
         steps = self.steps_needed(chromosome[None])
-        values = self._simulated(chromosome[None], steps, balanced=False).values[..., 0]
-        return values / self._noise_of_each()
+        return self._each_in_noise(steps, chromosome[None])[..., 0]
+
+    def _each_in_noise(self, steps: IntArray, chromosomes: FloatArray) -> FloatArray:
+        """The same of chromosomes (n, n_free), (n_residuals, n_outputs, n), by steps as given."""
+        steps = np.repeat(steps, len(chromosomes), axis=0)
+        values = self._simulated(chromosomes, steps, balanced=False).values
+        return values / self._noise_of_each()[..., None]
 
     def _noise_of_each(self) -> FloatArray:
         """Noise of the outputs in the units of residuals, (n_residuals, n_outputs)."""

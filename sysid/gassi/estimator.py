@@ -2,8 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -20,6 +21,7 @@ from sysid.fitting.refinement import begin, refine_each
 from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
 from sysid.gassi.excerpt import Excerpt
+from sysid.gassi.first_samples import noticed_starts, with_starts
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import NoisyInputs, fit_likelihood, promising
 from sysid.gassi.search_run import Best, SearchRun
@@ -91,6 +93,8 @@ class GASSI(RecordEstimator):
         ``error`` stays with the mean RMSE that the search minimises. ``auto`` is ``likelihood``
         without ``input_noise``, with it ``compensated``, and ``innovations`` with ``windows`` or
         ``process_noise``.
+    first_samples : states that start at their first sample whatever its noise. Others, where it
+        would move what is estimated by more than a standard deviation, get a start of their own.
     process_noise : {state: intensity} of white noise that drives states, for ``innovations``:
         standard deviation of the state after a second, were it to do nothing but sum that noise,
         in its unit over sqrt(s).
@@ -109,6 +113,7 @@ class GASSI(RecordEstimator):
     parameters_ : dict of all the model's parameters after ``fit``.
     vector_ : (n_parameters,), the same in the model's order.
     chromosome_ : (n_free,), the free parameters in ``space_.names`` order.
+    estimated_starts_ : states whose start was estimated for the noise of their first samples.
     initial_states_ : for each record a dict of the initial states that were estimated.
     guesses_ : {name: Guess} of the ranges that were read from the records.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
@@ -167,6 +172,7 @@ class GASSI(RecordEstimator):
     per_log: bool = False
     balance: Balance = "samples"
     criterion: Criterion = "auto"
+    first_samples: Collection[str] = ()
     process_noise: Mapping[str, float] | None = None
     accuracy: float = 1e-3
     max_steps: int = 512
@@ -200,6 +206,7 @@ class GASSI(RecordEstimator):
         Raises ModelError when every simulation of the first generation fails, for records without
         information, settings that make no sense, or a checkpoint of other data, settings or model.
         """
+        self.estimated_starts_: tuple[str, ...] = ()
         data = self._records(X, y, records, None, reset=True)
         model, preset = self._model(), self._preset()
         fixed = dict(self.fixed or {})
@@ -306,14 +313,17 @@ class GASSI(RecordEstimator):
         explored: bool = False,
     ) -> None:
         """Refit the minima of the mean RMSE by likelihood, and keep the likeliest."""
-        result = fit_likelihood(
-            objective,
-            minima,
-            watch,
-            noise=_OF_NOISY_INPUTS.get(self.criterion_),
-            process=self._process(),
-            explored=explored,
-        )
+        noise, process = _OF_NOISY_INPUTS.get(self.criterion_), self._process()
+        fit = partial(fit_likelihood, watch=watch, noise=noise, process=process)
+        result = fit(objective, minima, explored=explored)
+        likeliest = result.optimum
+        if not (isinstance(likeliest.objective, Innovations) and likeliest.objective.corrects):
+            fitted, chromosome = likeliest.objective, likeliest.chromosome
+            self.estimated_starts_ = noticed_starts(fitted, chromosome, self.first_samples)
+        if self.estimated_starts_:
+            found = [likeliest.chromosome, *result.rivals]
+            objective, minima = self._with_starts(objective, found)
+            result = fit(objective, minima, explored=True)
         likeliest, self._rivals, self._ridge = result.optimum, result.rivals, result.ridge
         self._final_accuracy = likeliest.objective.simulator.accuracy
         self._set_evaluated(self._at_final_accuracy(objective), likeliest.chromosome)
@@ -323,6 +333,18 @@ class GASSI(RecordEstimator):
             self.averaged_inputs_ = likeliest.objective.quiet
             if likeliest.objective.corrects and self.criterion_ == "compensated":
                 self.criterion_, self.criterion_reason_ = "innovations", _OVERWHELMED
+
+    def _with_starts(
+        self, objective: Objective, chromosomes: Sequence[FloatArray]
+    ) -> tuple[Objective, list[FloatArray]]:
+        """An objective and chromosomes (n_free,) with the starts in ``estimated_starts_``."""
+        model, before = self._model(), objective.space
+        started = [with_starts(model, objective.records, before, c) for c in chromosomes]
+        self.space_ = started[0][0]
+        anew = self._objective(objective.records)
+        anew.resume_count(objective.simulations)
+        self._set_evaluated(anew, started[0][1])
+        return anew, [chromosome for _, chromosome in started]
 
     def predict(self, X: Dataset | FloatArray, *, records: Any = None) -> FloatArray:
         """Free-run outputs of the identified model, (n_samples, n_outputs).
@@ -442,7 +464,8 @@ class GASSI(RecordEstimator):
     def _model(self) -> ProcessModel:
         if self.model is None:
             raise ModelError("GASSI needs a process model: GASSI(model)")
-        return self.model
+        starts = getattr(self, "estimated_starts_", ())
+        return self.model.with_initial(dict.fromkeys(starts, "estimate"))
 
     def simulator(self) -> BatchSimulator:
         """The model's simulator, by the estimator's settings."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import TOLERANCE, Point, Restriction
-from sysid.fitting.free_run import FINER, FINEST
+from sysid.fitting.free_run import FINER, FINEST, resolved
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
@@ -40,7 +40,6 @@ _SWINGING = -0.5  # a round's change of a noise's logarithm in parts of the one 
 _LEAST_SHARE = 1e-2
 # Errors below this part of the simulation's accuracy are its own: there is no noise to weigh by.
 _SIMULATION_SHARE = 0.1
-_FINER, _FINEST = 1e-3, 1e-9
 _TINY = 1e-300
 # Colour does not make an output's errors count as fewer independent samples than this.
 _FEWEST = 30.0
@@ -109,15 +108,15 @@ def fit_likelihood(
     roughly = noise == "innovations"
     lookalike = not (explored or roughly)
     optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=roughly)
+    if not roughly:
+        objective, optima = _in_noise(objective, optima, watch)
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
         for corrects in (False, True) if noise == "compensated" else (True,):
             fit = partial(noisy_fit, corrects, process, objective)
             refitted = refitted or _refitted(fit, objective, [best, *others], optima, watch)
-    if refitted is None:
-        best = _exact(best)
-    else:
+    if refitted is not None:
         optima = refitted
         best, *others = optima.ranked()
     rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
@@ -323,6 +322,21 @@ def _explored(
     return optima
 
 
+def _in_noise(
+    objective: Objective, optima: _Optima, watch: Watch | None
+) -> tuple[Objective, _Optima]:
+    """Minima anew by as many steps as the best one's errors let the data tell, if by more."""
+    best, *others = optima.ranked()
+    rms = np.maximum(best.rms, max(_LEAST_SHARE * best.rms.max(), _TINY))
+    finer = resolved(best.objective, best.chromosome, rms)
+    if finer is best.objective:
+        return objective, optima
+    near = [other for other in others if optima.deviance(other, best) < _CONCEIVABLE]
+    minima = _chromosomes([best, *near])
+    objective = objective.finer(finer.simulator.accuracy)
+    return objective, _explored(objective, minima, watch, lookalike=False)
+
+
 def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
     """The objective with simulations as accurate as they are meant to be, at a chromosome.
 
@@ -337,16 +351,6 @@ def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
             break
         objective = objective.finer(FINER * objective.simulator.accuracy)
     return objective
-
-
-def _exact(optimum: Optimum) -> Optimum:
-    """A minimum whose errors are the simulation's, refined with finer simulations."""
-    accuracy = optimum.objective.simulator.accuracy
-    if optimum.rms.max() > _SIMULATION_SHARE * accuracy:
-        return optimum
-    objective = optimum.objective.finer(max(_FINER * accuracy, _FINEST))
-    end = refine(objective, optimum.chromosome)
-    return _optimum(objective, end.chromosome, end.rms)
 
 
 def _weighed(

@@ -101,8 +101,9 @@ def covariance(
     score = score_covariance(weighted, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = _larger(score, _score_covariance_by_inputs(sensitivity, weighted))
-    for errors in (zero_errors, start_errors, parabola_errors):
-        score += _score_covariance_by(weighted, errors(sensitivity))
+    starts = (change for _, change in start_errors(sensitivity))
+    for errors in (zero_errors(sensitivity), starts, parabola_errors(sensitivity)):
+        score += _score_covariance_by(weighted, errors)
     pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, slopes.shape[2])
     score += pushes.T @ pushes
     rows = (slopes * np.sqrt(weight)[:, None]).reshape(-1, slopes.shape[2])

@@ -175,22 +175,23 @@ def given_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
         yield np.where(np.isfinite(slope), slope, 0.0)
 
 
-def start_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+def start_errors(sensitivity: Sensitivity) -> Iterator[tuple[int, FloatArray]]:
     """Changes (n_residuals, n_outputs) by a deviation of each first sample that a run starts at.
 
-    Such a run keeps the noise of one sample for as long as the plant remembers its start.
+    Behind the place of the state that starts there. Such a run keeps the noise of one sample for
+    as long as the plant remembers its start.
     """
     objective = sensitivity.objective
     places = zip(objective.records, record_rows(sensitivity.lengths), objective.scales, strict=True)
     for k, (record, rows, scale) in enumerate(places):
         left = sensitivity.residual[rows] * scale
-        for j in record.starts_at_samples(objective.simulator.model):
+        for state, j in enumerate(record.starts_at_samples(objective.simulator.model)):
             if j is None:
                 continue
             outputs = record.outputs.copy()
             outputs[0, j] += record.sample_noise(j, left[:, j])
             change = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
-            yield change * sensitivity.share
+            yield state, change * sensitivity.share
 
 
 def parabola_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:

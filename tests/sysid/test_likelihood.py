@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
 from sysid import GASSI, BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
@@ -418,3 +421,42 @@ def test_a_ridge_is_told_alike_by_every_seed(far_below_half):
             assert one.why == same.why
             ends = [[e.low or 0.0, np.inf if e.high is None else e.high] for e in (one, same)]
             np.testing.assert_allclose(ends[0], ends[1], rtol=1e-2)
+
+
+def test_an_output_measured_far_better_than_a_search_simulates_has_all_the_steps_it_wants():
+    """The angle of a pendulum by an encoder; the truth by SciPy."""
+    truth, dt, n, noise = {"stiffness": 40.0, "friction": 0.5, "gain": 30.0}, 0.02, 250, 1e-6
+
+    def derivative(x, u, p):
+        return (x[1], p[2] * u[0] - p[0] * math.sin(x[0]) - p[1] * math.tanh(x[1] / 0.5))
+
+    model = ProcessModel(
+        name="pendulum",
+        states=(State("angle", "rad"), State("speed", "rad/s")),
+        inputs=(Input("u", "N*m"),),
+        outputs=(Output("angle", "rad"),),
+        parameters=tuple(
+            Parameter(name, "1", 1.3 * value, 0.1 * value, 10.0 * value, "log")
+            for name, value in truth.items()
+        ),
+        derivative=derivative,
+    )
+    rng = np.random.default_rng(0)
+    u, rows = prbs(rng, n, -1.0, 1.0), [np.zeros(2)]
+    for given in u[:-1]:
+        rows.append(
+            solve_ivp(
+                lambda t, x, given=given: derivative(x, (given,), tuple(truth.values())),
+                (0.0, dt), rows[-1], method="DOP853", rtol=1e-11, atol=1e-12,
+            ).y[:, -1]
+        )  # fmt: skip
+    angle = np.array(rows)[:, 0]
+    angle[1:] += noise * rng.standard_normal(n - 1)
+    record = Dataset(u, angle, dt)
+    minimum = np.array(list(truth.values()))
+    end = fit_likelihood(objective_of(model, record), [minimum], explored=True).optimum
+    estimates = uncertainty(end.objective, end.chromosome).parameters
+    known = {e.name: e.std for e in estimates if e.std is not None and e.std < 1e-5 * e.value}
+    assert known.keys() == truth.keys()
+    errors = {e.name: (e.value - truth[e.name]) / known[e.name] for e in estimates}
+    assert max(map(abs, errors.values())) < 3.5, errors

@@ -17,6 +17,7 @@ from sysid import (
 )
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
+from sysid.gassi import GASSI
 from sysid.judging.expected_errors import expected_errors
 from sysid.uncertainty import uncertainty
 
@@ -80,3 +81,31 @@ def test_noise_below_fast_motion_is_that_which_the_model_leaves():
     expected = expected_errors(SIMULATOR, SPACE, np.array([RATE]), record, start, None)
     size = np.sqrt(np.mean(np.sum(expected.systematic**2, axis=2)))
     assert size == pytest.approx(SIGMA, rel=0.2)
+
+
+def test_a_start_whose_noise_would_tell_more_than_all_else_is_estimated():
+    """Least squares of a line through all samples know its slope by sqrt(12 / n) / T."""
+    expected = SIGMA * np.sqrt(12.0 / N) / (N * DT)
+    deviations, errors = [], []
+    for seed in range(4):
+        rng = np.random.default_rng([7, seed])
+        y = RATE * DT * np.arange(N) + SIGMA * rng.standard_normal(N)
+        estimator = GASSI(INTEGRATOR, population=10, generations=2)
+        estimator.fit(Dataset(np.ones(N), y, DT))
+        assert estimator.estimated_starts_ == ("y",)
+        rate = estimator.uncertainty(Dataset(np.ones(N), y, DT)).parameters[0]
+        slope = np.polyfit(DT * np.arange(N), y, 1)[0]
+        assert rate.value == pytest.approx(slope, abs=0.02 * expected)
+        deviations.append(rate.std)
+        errors.append(rate.value - RATE)
+    np.testing.assert_allclose(deviations, expected, rtol=0.15)
+    assert np.abs(errors).max() < 3.0 * expected
+
+
+def test_a_start_that_is_to_be_its_first_sample_stays_there():
+    y = RATE * DT * np.arange(N) + SIGMA * np.random.default_rng(7).standard_normal(N)
+    record = Dataset(np.ones(N), y, DT)
+    estimator = GASSI(INTEGRATOR, population=10, generations=2, first_samples=["y"]).fit(record)
+    assert estimator.initial_states_ == []
+    t = DT * np.arange(N)
+    assert estimator.parameters_["rate"] == pytest.approx(t @ (y - y[0]) / (t @ t), rel=1e-6)

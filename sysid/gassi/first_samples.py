@@ -1,0 +1,55 @@
+"""States that start at a measured first sample, whose noise a run keeps as long as it remembers it.
+
+Of a position that is a long time: the noise of one sample then counts for more than that of all
+others together, and the start is better estimated than read.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.arrays import FloatArray
+from sysid.fitting.objective import Objective
+from sysid.problem.data import Dataset
+from sysid.problem.model import ProcessModel
+from sysid.problem.space import SearchSpace
+from sysid.uncertainty.sensitivity import sensitivity, start_errors
+
+_NOTICEABLE = 1.0  # deviations of any quantity that the noise of first samples may move it by
+
+
+def noticed_starts(
+    objective: Objective, chromosome: FloatArray, kept: Collection[str]
+) -> tuple[str, ...]:
+    """States whose first samples' noise moves a quantity noticeably, at a minimum (n_free,).
+
+    kept: names of states that start there all the same.
+    """
+    local, names = sensitivity(objective, chromosome), objective.simulator.model.state_names
+    noise = np.sqrt(np.mean(local.residual**2, axis=0))
+    noise = np.where(noise > 0.0, noise, np.inf)
+    slopes = (local.slopes / noise[:, None]).reshape(-1, local.slopes.shape[2])
+    lengths = np.linalg.norm(slopes, axis=0)
+    directions, _ = np.linalg.qr(slopes[:, lengths > 0.0] / lengths[lengths > 0.0])
+    squares = np.zeros(len(names))
+    for state, change in start_errors(local):
+        squares[state] += np.sum((directions.T @ (change / noise).ravel()) ** 2)
+    noticed = (names[i] for i in np.flatnonzero(squares > _NOTICEABLE**2))
+    return tuple(name for name in noticed if name not in kept)
+
+
+def with_starts(
+    model: ProcessModel, records: Sequence[Dataset], before: SearchSpace, chromosome: FloatArray
+) -> tuple[SearchSpace, FloatArray]:
+    """A space in which a model's starts are estimated besides those of before; and a chromosome.
+
+    chromosome: (n_free,), of the space before, whose further starts are at their first samples.
+    """
+    space = replace(before.without_starts(), model=model).with_starts(records)
+    bare = len(space.index)
+    known = dict(zip(before.estimated, chromosome[bare:].tolist(), strict=True))
+    begun = space.with_nominal_starts(chromosome[:bare])
+    starts = zip(space.estimated, begun[bare:].tolist(), strict=True)
+    begun[bare:] = [known.get(place, first) for place, first in starts]
+    return space, begun
