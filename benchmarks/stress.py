@@ -64,8 +64,10 @@ def fitted(case: Case, training: list[Dataset], seed: int) -> GASSI:
 
 def wrong(case: Case, estimator: GASSI, training: list[Dataset], seed: int) -> set[str]:
     """Determined quantities whose intervals exclude the truth."""
-    truth, estimates = case.truth(seed), estimator.uncertainty(training).determined()
-    return {estimate.name for estimate in estimates if estimate.excludes(truth)}
+    starts = estimator.space_.names[len(estimator.space_.index) :]  # of which nothing is asked
+    determined = estimator.uncertainty(training).determined()
+    estimates = [estimate for estimate in determined if estimate.name not in starts]
+    return {estimate.name for estimate in estimates if estimate.excludes(case.truth(seed))}
 
 
 def main() -> None:

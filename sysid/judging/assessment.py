@@ -42,6 +42,7 @@ FITTED = 50.0  # fit [%] below which a model explains little
 # Correlation with an input below which what is left is found in long records, but is nothing to
 # mend: one per cent of the residuals' variance.
 _NOTICEABLE = 0.1
+_MOSTLY = 0.3  # above which it is no noise at all
 # Of an output's variance, beyond which what a model leaves may have moved its parameters, and share
 # of the autocorrelations inside their band, below which it is no noise of that output's sensor.
 _MUCH, _WANDERS = 0.025, 0.25
@@ -374,7 +375,9 @@ def _unexplained(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
     fits = mean_known([result.metrics.fit for result in results], 0)
     shares = np.mean([result.residuals.white for result in results], axis=0)
     above, calibrated = _above_noise(results), _known(results)
-    follows, parts = _follows(results), _input_parts(results)
+    above_rounding = (1.0 - fits / 100.0 > _ROUNDING)[:, None]
+    mostly = (_input_correlations(results)[1] > _MOSTLY) & above_rounding
+    follows = _follows(results) & (mostly | (_input_parts(results) > _TRACE))
     for j, output in enumerate(model.output_names):
         left = (1.0 - fits[j] / 100.0) ** 2
         if above[j]:
@@ -390,7 +393,7 @@ def _unexplained(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
                 "a measured input that came through the plant, or dynamics that the model lacks. "
                 "Parameters that act on it may be off by more than their intervals."
             )
-        elif (follows[j] & (parts[j] > _TRACE)).any() and not calibrated[j]:
+        elif follows[j].any() and not calibrated[j]:
             inputs = [model.input_names[i] for i in np.flatnonzero(follows[j])]
             yield (
                 f"What is left of {output} follows {' and '.join(inputs)}: parameters that act on "
@@ -594,8 +597,8 @@ def _praise(model: ProcessModel, validation: Sequence[RecordResult]) -> str:
         names = [n for n, at in zip(model.output_names, at_noise, strict=True) if at]
         reason += f", {', '.join(names)} down to the noise"
     if len(traces):
-        reason += ", and of the inputs no more than a trace is left in the residuals "
-        reason += f"(correlations of at most {traces.max():.2f})"
+        reason += ", and what the residuals keep of the inputs is no more than a trace of the "
+        reason += f"outputs (correlations of at most {traces.max():.2f})"
     elif np.isfinite(shares).any():
         reason += ", and nothing of the inputs is left in the residuals"
     return f"{reason}."

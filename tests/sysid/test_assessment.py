@@ -182,8 +182,23 @@ def test_a_trace_of_an_input_in_a_long_record_is_nothing_to_mend():
     trace, much = long(0.07), long(0.3)
     assert np.all(trace.residuals.independent < 0.1)
     told = verdict([trace], [trace])
-    assert told.trust == "good" and "no more than a trace is left" in told.reasons[0]
+    assert told.trust == "good" and "no more than a trace" in told.reasons[0]
     assert "follow" in verdict([much], [much]).reasons[0]
+
+
+def test_what_follows_an_input_is_no_noise_however_small():
+    """Play at an encoder is next to nothing of its angle, but more than intervals tell."""
+
+    def record(part, seed):
+        slow = np.sin(np.arange(2000) / 30.0)[:, None] * [1.0, 1.0]
+        data = Dataset(slow, slow + 0.5, 0.01, "play")
+        noise = np.random.default_rng(seed).standard_normal((2000, 2))
+        return examine(data, data.outputs - 1e-3 * (noise + part * slow))
+
+    play = verdict([record(1.5, 1)], [record(1.5, 2)])
+    assert play.predicted.trust == "good" and "no more than a trace" in play.predicted.reasons[0]
+    assert play.parameters.trust == "limited" and "follows" in play.parameters.reasons[0]
+    assert verdict([record(0.15, 1)], [record(0.15, 2)]).trust == "good"
 
 
 @pytest.mark.parametrize("size", [1e-4, 1e-16])
