@@ -173,8 +173,8 @@ def fit(
 
 
 _STARTED = (
-    "where {0} starts is estimated: the noise of its first sample would move parameters "
-    "(initial.{0}=first starts there all the same)"
+    "where {0} starts is estimated, as the noise of its first sample would move parameters; "
+    "--set initial.{0}=first keeps it there"
 )
 
 
