@@ -321,8 +321,8 @@ class GASSI(RecordEstimator):
             fitted, chromosome = likeliest.objective, likeliest.chromosome
             self.estimated_starts_ = noticed_starts(fitted, chromosome, self.first_samples)
         if self.estimated_starts_:
-            found = [likeliest.chromosome, *result.rivals]
-            objective, minima = self._with_starts(objective, found)
+            minima = [likeliest.chromosome, *result.rivals]
+            objective, minima = self._with_starts(objective, minima)
             result = fit(objective, minima, explored=True)
         likeliest, self._rivals, self._ridge = result.optimum, result.rivals, result.ridge
         self._final_accuracy = likeliest.objective.simulator.accuracy

@@ -48,8 +48,8 @@ def with_starts(
     """
     space = replace(before.without_starts(), model=model).with_starts(records)
     bare = len(space.index)
-    known = dict(zip(before.estimated, chromosome[bare:].tolist(), strict=True))
+    starts_before = dict(zip(before.estimated, chromosome[bare:].tolist(), strict=True))
     begun = space.with_nominal_starts(chromosome[:bare])
     starts = zip(space.estimated, begun[bare:].tolist(), strict=True)
-    begun[bare:] = [known.get(place, first) for place, first in starts]
+    begun[bare:] = [starts_before.get(place, first) for place, first in starts]
     return space, begun

@@ -331,7 +331,7 @@ def _in_noise(
     finer = resolved(best.objective, best.chromosome, rms)
     if finer is best.objective:
         return objective, optima
-    near = [other for other in others if optima.deviance(other, best) < _CONCEIVABLE]
+    near = (optimum for optimum in others if optima.deviance(optimum, best) < _CONCEIVABLE)
     minima = _chromosomes([best, *near])
     objective = objective.finer(finer.simulator.accuracy)
     return objective, _explored(objective, minima, watch, lookalike=False)
