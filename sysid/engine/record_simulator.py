@@ -189,10 +189,12 @@ class RecordSimulator:
         kalman: Filter,
         noise: FloatArray,
         scatter: FloatArray,
+        trust: FloatArray,
         process: FloatArray,
         colour: FloatArray,
         corrects: bool,
         exact: bool,
+        beyond: FloatArray | None,
         parameters: FloatArray,
         starts: FloatArray | None,
         lanes: IntArray,
@@ -202,18 +204,19 @@ class RecordSimulator:
         """As ``residuals``, of the innovations of a filter, in parts of the outputs' noise.
 
         noise: (n_outputs,), standard deviations; scatter: (n_samples, n_outputs), variances of
-        single samples beside it. process: (n_states,), standard deviations of the states' rates
+        single samples beside it; trust: of that shape, factors of what is kept of the innovations.
+        process: (n_states,), standard deviations of the states' rates
         over the root of a second. colour: (n_inputs,), how much of the inputs' noise goes on from
         sample to sample. corrects: whether the filter takes outputs in. exact: whether means are
-        what free runs say, of outputs that are no parabolas between samples. A state that
-        starts at the first sample of an output has that sample's error. Returns with the sums of
-        squares those of the logarithms of the innovations' variances in parts of the outputs',
-        (n, n_outputs).
+        what free runs say, of outputs that are no parabolas between samples; beyond: (n_samples,
+        n_outputs, n), what these say, where it is known. A state that starts at the first sample
+        of an output has that sample's error. Returns with the sums of squares those of the
+        logarithms of the innovations' variances in parts of the outputs', (n, n_outputs).
         """
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
         padded = lanes.take(_ALL_LANES, mode="wrap")
         first = [*record.starts_at_samples(model), *[None] * kernel.n_states]
-        weights = self._weights.copy()
+        weights = self._weights * trust
         weights[0, [j for j in first if j is not None]] = 0.0
         variances = noise**2 + scatter
         spread = [0.0 if (j := first[i]) is None else variances[0, j] for i in kernel.reached]
@@ -234,7 +237,9 @@ class RecordSimulator:
             self._inputs_of[tuple(kernel.splines)] = inputs
         weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
-        if exact:
+        if beyond is not None:
+            measured[..., : len(lanes)] -= beyond
+        elif exact:
             measured -= self.beyond_parabolas(parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(

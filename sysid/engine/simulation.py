@@ -206,27 +206,31 @@ class BatchSimulator:
         noise: FloatArray,
         *,
         scatter: Sequence[FloatArray] | None = None,
+        trust: Sequence[FloatArray] | None = None,
         process: FloatArray | None = None,
         colour: Sequence[FloatArray] | None = None,
         corrects: bool = True,
         exact: bool = False,
+        beyond: Sequence[FloatArray] | None = None,
         balanced: bool = True,
     ) -> Residuals:
         """As ``residuals``, of the innovations of an extended Kalman filter.
 
         Noise of the inputs is the records' own; noise: (n_outputs,), standard deviations of the
         outputs; scatter: per record, (n_samples, n_outputs), variances that single samples have
-        beside that; process: (n_states,), intensities of the process's noise, standard deviations
-        of the states' rates over the root of a second; colour: per record, (n_inputs,), parts of
-        the inputs' noise that go on from sample to sample, default none. An innovation is scaled by
-        the output's noise over its own standard deviation: without noise of inputs and process
-        innovations are the residuals. With noise of the process, where ``balanced``, all of an
-        output are multiplied by the geometric mean of those deviations: their sum of squares is
-        then least where the likelihood of an output of unknown noise is largest. Unless it
-        ``corrects`` itself by the outputs, they are those of the free run, scaled so. Averaged
-        outputs are taken for parabolas between samples, unless means are to be ``exact`` to what
-        free runs tell of how they run there. See
-        ``filter_kernel``. Raises ModelError for equations that cannot be differentiated.
+        beside that; trust: per record, (n_samples, n_outputs), factors of the innovations, default
+        1, though all are taken in; process: (n_states,), intensities of the process's noise,
+        standard deviations of the states' rates over the root of a second; colour: per record,
+        (n_inputs,), parts of the inputs' noise that go on from sample to sample, default none. An
+        innovation is scaled by the output's noise over its own standard deviation: without noise
+        of inputs and process innovations are the residuals. With noise of the process, where
+        ``balanced``, all of an output are multiplied by the geometric mean of those deviations:
+        their sum of squares is then least where the likelihood of an output of unknown noise is
+        largest. Unless it ``corrects`` itself by the outputs, they are those of the free run,
+        scaled so. Averaged outputs are taken for parabolas between samples, unless means are to be
+        ``exact`` to what free runs tell of how they run there, or to ``beyond``, per record
+        (n_samples, n_outputs, n), as of ``beyond_parabolas``. See ``filter_kernel``. Raises
+        ModelError for equations that cannot be differentiated.
         """
         process = np.zeros(len(self.model.states)) if process is None else process
         driven = tuple(np.flatnonzero(process).tolist())
@@ -240,13 +244,16 @@ class BatchSimulator:
         logarithms = np.zeros((len(parameters), len(records), len(noise)))
         if scatter is None:
             scatter = [np.zeros(record.outputs.shape) for record in records]
+        if trust is None:
+            trust = [np.ones(record.outputs.shape) for record in records]
 
         def simulate(
             r: int, simulator: RecordSimulator, values: FloatArray, lanes: IntArray, steps: int
         ) -> tuple[FloatArray, FloatArray]:
+            shape = None if beyond is None else beyond[r][..., lanes]
             sse, logarithms[lanes, r] = simulator.innovations(
-                kalman, noise, scatter[r], process, colours[r], corrects, exact, parameters,
-                starts[r], lanes, steps, values,
+                kalman, noise, scatter[r], trust[r], process, colours[r], corrects, exact, shape,
+                parameters, starts[r], lanes, steps, values,
             )  # fmt: skip
             return sse, np.where(np.isfinite(sse).all(axis=1), 0.0, np.inf)
 

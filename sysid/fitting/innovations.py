@@ -27,7 +27,7 @@ belongs to the sum: without it, parameters that pass on more of that noise would
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import comb
 from typing import Any, Self
@@ -71,6 +71,27 @@ _MANY = 32  # a sample, with which no covariance bursts
 _BURST = 0.1  # of the innovations, by which steps of a free run may change them
 
 
+@dataclass(frozen=True)
+class Shape:
+    """By how much means over windows are not those of parabolas, in proportion around a place.
+
+    at: (n_free,), search coordinates. values: per record, (n_samples, n_outputs); slopes: of these,
+    (n_samples, n_outputs, n_free).
+    """
+
+    at: FloatArray
+    values: list[FloatArray]
+    slopes: list[FloatArray]
+
+    def of(self, coded: FloatArray) -> list[FloatArray]:
+        """Per record, (n_samples, n_outputs, n), at search coordinates (n, n_free)."""
+        moves = (coded - self.at).T
+        return [
+            value[..., None] + slope @ moves
+            for value, slope in zip(self.values, self.slopes, strict=True)
+        ]
+
+
 class Innovations(Objective):
     """As ``Objective``, of innovations scaled to the outputs' own noise.
 
@@ -81,7 +102,8 @@ class Innovations(Objective):
     samples beside the noise, by the jitter of their windows. Where it corrects, the records have
     each mean over a window once. coarseness: integration steps of a free run that one of the
     filter's stands for; least: of the filter's in a sample. exact: whether averages are not of
-    parabolas between samples.
+    parabolas between samples. shape: by how much they are not, where that is known. trust: per
+    record, (n_samples, n_outputs), parts of each innovation that count.
     """
 
     noise: FloatArray
@@ -94,6 +116,8 @@ class Innovations(Objective):
     coarseness: float
     least: int
     exact: bool
+    shape: Shape | None
+    trust: list[FloatArray]
 
     @classmethod
     def of(
@@ -122,7 +146,8 @@ class Innovations(Objective):
             variant.records, variant.colour = [q.record for q in parts], [q.colour for q in parts]
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.scatter = [scatter(record) for record in variant.records]
-        variant.corrects, variant.exact = corrects, False
+        variant.trust = _full(variant.records)
+        variant.corrects, variant.exact, variant.shape = corrects, False, None
         variant.coarseness, variant.least = 1.0, 1
         n_states = len(objective.simulator.model.states)
         variant.process = np.zeros(n_states) if process is None else process
@@ -146,8 +171,8 @@ class Innovations(Objective):
         # A filter is best told all; what averages lose of the inputs repeats itself.
         may_average = corrects and _may_average(objective, chromosome, steps, residual)
         if may_average and np.any(plain.bent(chromosome) > MISJUDGED):
-            averaged = cls.of(objective, error, quiet=True, **settings)
-            return averaged._noise_found(chromosome).eased(chromosome)
+            averaged = cls.of(objective, error, quiet=True, **settings)._noise_found(chromosome)
+            return averaged.renewed(chromosome).eased(chromosome)
         return plain.eased(chromosome)
 
     def _noise_found(self, chromosome: FloatArray) -> Self:
@@ -165,10 +190,30 @@ class Innovations(Objective):
         """
         if not self.corrects:
             return self
-        eased = self._with(exact=False)._with_fewest_steps(chromosome, moving)
-        exact = eased._with(exact=True)
-        missed = exact._in_noise(chromosome) - eased._in_noise(chromosome)
-        return eased if eased._moved_by(missed, chromosome) < _OFF else exact
+        eased = self._with_fewest_steps(chromosome, moving)
+        return eased._with(exact=eased.rings_at(chromosome[None]))
+
+    @property
+    def exact_means(self) -> Self:
+        """With averages as outputs run between samples."""
+        return self._with(exact=True)
+
+    def rings_at(self, chromosomes: FloatArray) -> bool:
+        """Whether averages of parabolas move quantities at the one of (n, n_free) that rings most.
+
+        What is exact stays so: parabolas prefer minima at which they do not.
+        """
+        if self.exact or not any(record.windows.size for record in self.records):
+            return self.exact
+        steps = self.steps_needed(chromosomes)
+        exact, parabolas = (
+            by._simulated(chromosomes, steps, balanced=False).values
+            for by in (self.exact_means, self)
+        )
+        missed = (exact - parabolas) / self._noise_of_each()[..., None]
+        sizes = np.nan_to_num(np.linalg.norm(missed, axis=(0, 1)), nan=0.0, posinf=0.0)
+        most = int(np.argmax(sizes))
+        return self._moved_by(missed[..., most], chromosomes[most]) >= _OFF
 
     def _with_fewest_steps(self, chromosome: FloatArray, moving: float) -> Self:
         exact = self.uneased._in_noise(chromosome)
@@ -191,6 +236,25 @@ class Innovations(Objective):
                 break
             finer = self._with(coarseness=coarseness)
         return finer
+
+    def around(self, chromosome: FloatArray) -> Self:
+        """The same near a chromosome, (n_free,), where free runs need not tell each mean anew."""
+        if not self.exact:
+            return self
+        lower, upper = self.space.coded_bounds
+        at, distance = self.space.encode(chromosome), _MOVE * (upper - lower)
+        coded = np.vstack([at, at + np.diag(distance), at - np.diag(distance)])
+        chromosomes = self.space.decode(coded)
+        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
+        values, slopes, n = [], [], len(at)
+        steps = self.steps_needed(chromosome[None])[0].tolist()
+        for record, count, start in zip(self.records, steps, starts, strict=True):
+            beyond = self.simulator.beyond_parabolas(vectors, record, count, start)
+            beyond = np.where(np.isfinite(beyond), beyond, 0.0)
+            values.append(beyond[0])
+            change = beyond[1 : n + 1] - beyond[n + 1 :]
+            slopes.append(np.moveaxis(change, 0, -1) / (2.0 * distance))
+        return self._with(shape=Shape(at, values, slopes))
 
     @property
     def uneased(self) -> Self:
@@ -292,13 +356,14 @@ class Innovations(Objective):
         part = super().on(records, places)
         if places is not None:
             colours = [self.colour[place] for place in places]
-            vars(part).update(colour=colours, scatter=[scatter(record) for record in records])
+            scatters = [scatter(record) for record in records]
+            vars(part).update(colour=colours, scatter=scatters, trust=_full(records))
         return part
 
     def of_record(self, place: int, record: Dataset) -> Objective:
-        """As of ``Objective``, with the scatter of the record in whose place it is."""
+        """As of ``Objective``, with scatter and trust of the record in whose place it is."""
         part = super().of_record(place, record)
-        vars(part).update(scatter=[self.scatter[place]])
+        vars(part).update(scatter=[self.scatter[place]], trust=[self.trust[place]])
         return part
 
     @property
@@ -359,8 +424,35 @@ class Innovations(Objective):
     def bent(self, chromosome: FloatArray) -> FloatArray:
         """Share of the outputs' innovations, (n_outputs,), that a filter misjudges at (n_free,).
 
-        It takes equations for straight over what noise does. Noise added to the inputs and the
-        same taken from them move an innovation there by opposite amounts.
+        It takes equations for straight over what noise does.
+        """
+        seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
+        bent = seen & ~(np.median(np.abs(self._bends(chromosome)), axis=0) <= _BENT)
+        share: FloatArray = bent.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+        return share
+
+    def renewed(self, chromosome: FloatArray) -> Self:
+        """With the trust and the noise that a chromosome, (n_free,), asks for."""
+        return self.doubting(chromosome).settled(chromosome)
+
+    def doubting(self, chromosome: FloatArray) -> Self:
+        """With innovations counted by the deviations that they have, bends at (n_free,) included.
+
+        It takes in what was measured as before: what was foreseen is uncertain. Where inputs are
+        not averaged nothing bends noticeably, or nothing helps.
+        """
+        if not self.quiet:
+            return self
+        bends = self._with(exact=False)._bends(chromosome)
+        variances = np.mean(np.where(np.isfinite(bends), bends, 0.0) ** 2, axis=0)
+        ends = np.cumsum([record.n_samples for record in self.records])[:-1]
+        return self._with(trust=np.split(1.0 / np.sqrt(1.0 + variances), ends))
+
+    def _bends(self, chromosome: FloatArray) -> FloatArray:
+        """What noise does to innovations but in proportion, (n_draws, n_residuals, n_outputs).
+
+        In parts of their deviations. Noise added to the inputs and the same taken from them move
+        an innovation by opposite amounts where equations are straight.
         """
         steps = self.steps_needed(chromosome[None])
         rng = np.random.default_rng(0)
@@ -370,7 +462,7 @@ class Innovations(Objective):
                 replace(record, inputs=record.inputs + move)
                 for record, move in zip(self.records, moves, strict=True)
             ]
-            moved = self._with(records=records)
+            moved = self._with(records=records, trust=_full(records))
             values: FloatArray = moved._simulated(chromosome[None], steps, balanced=False).values[
                 ..., 0
             ]
@@ -383,12 +475,8 @@ class Innovations(Objective):
                 for record, colour in zip(self.records, self.colour, strict=True)
             ]
             middle = 0.5 * (innovations(noise) + innovations([-move for move in noise]))
-            bends.append(np.abs(middle - centre))
-        units = self._noise_of_each()
-        seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
-        bent = seen & ~(np.median(bends, axis=0) <= _BENT * units)
-        share: FloatArray = bent.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-        return share
+            bends.append((middle - centre) / self._noise_of_each())
+        return np.array(bends)
 
     def share(self, chromosome: FloatArray, steps: IntArray) -> FloatArray:
         """Residuals in parts of the free run's where nothing corrects, (n_residuals, n_outputs)."""
@@ -420,12 +508,19 @@ class Innovations(Objective):
             starts,
             self.noise,
             scatter=self.scatter,
+            trust=self.trust,
             process=self.process,
             colour=self.colour,
             corrects=self.corrects,
             exact=self.exact,
+            beyond=None if self.shape is None else self.shape.of(self.space.encode(chromosomes)),
             balanced=balanced,
         )
+
+
+def _full(records: Sequence[Dataset]) -> list[FloatArray]:
+    """Trust in all of their samples."""
+    return [np.ones(record.outputs.shape) for record in records]
 
 
 def _may_average(

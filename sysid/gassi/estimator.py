@@ -433,7 +433,7 @@ class GASSI(RecordEstimator):
             quiet=self.averaged_inputs_,
             near=self.chromosome_,
         )
-        return fitted.eased(self.chromosome_)
+        return fitted.doubting(self.chromosome_).eased(self.chromosome_)
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""

@@ -34,6 +34,7 @@ from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 _ROUNDS = 6  # of weights and parameters in turn
 _NOISE_ROUNDS = 20  # the same of noise, weights and parameters
 _STEADY = 1e-3  # share by which weights may still change
+_RENEWED = 0.05  # change of a noise, where all else has come to rest, by which a fit goes on
 _SWINGING = -0.5  # a round's change of a noise's logarithm in parts of the one before
 # An output explained much better than the others keeps this share of the largest error, or the
 # arithmetic of its last digits would decide.
@@ -128,14 +129,14 @@ def fit_likelihood(
 
 
 def _resting(best: Optimum) -> Optimum:
-    """The minimum of a filter with as many steps as an answer wants."""
+    """The minimum of a filter with as many steps as an answer wants, and by what bends there."""
     fitted = best.objective
     if not (isinstance(fitted, Innovations) and fitted.corrects):
         return best
     finer = fitted.exactly(best.chromosome)
-    if finer.coarseness == fitted.coarseness:
+    if finer.coarseness == fitted.coarseness and not fitted.quiet:
         return best
-    settled = finer.settled(best.chromosome)
+    settled = finer.renewed(best.chromosome)
     end = refine(settled, best.chromosome)
     return _optimum(settled, end.chromosome, end.rms)
 
@@ -405,6 +406,10 @@ def _refitted(
             break
         explored = best
         starts += lookalikes(first.objective, best.chromosome) if filters else []
+        exact = _exact_among(first, starts) if filters else None
+        if exact is not None:
+            optima = _Optima.around(exact, objective, too_well)
+            first = best = explored = exact
         ends = _conceivable(first.objective, starts, optima, best)
         for optimum in _compared(first.objective, ends):
             optima.add(optimum)
@@ -432,6 +437,17 @@ def _compared(objective: Objective, ends: Sequence[Refinement]) -> list[Optimum]
     chromosomes = [end.chromosome for end in refine_each(objective, begun)]
     errors = _exactly(objective).rms(np.stack(chromosomes))
     return [_optimum(objective, *pair) for pair in zip(chromosomes, errors, strict=True)]
+
+
+def _exact_among(first: Optimum, starts: Sequence[FloatArray]) -> Optimum | None:
+    """A filter's minimum by exact means, if starts (n_free,) ask for these and it did not."""
+    fitted = first.objective
+    assert isinstance(fitted, Innovations)
+    if fitted.exact or not starts or not fitted.rings_at(np.stack(starts)):
+        return None
+    exact = fitted.exact_means
+    end = refine(exact, first.chromosome)
+    return _optimum(exact, end.chromosome, end.rms)
 
 
 def _exactly(objective: Objective) -> Objective:
@@ -594,9 +610,17 @@ def noisy_fit(
         steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
         end = refine(weighed, chromosome, on_iteration=watch)
         chromosome, rms, fitted = end.chromosome, end.rms, weighed
-        if steady:
+        if steady and not fitted.quiet:
             break
-        fitted, last = towards(fitted, fitted.settled(chromosome), last)
+        if steady:
+            # Where it began neither what bends nor what parabolas miss could be told well.
+            anew = fitted.renewed(chromosome).eased(chromosome)
+            alike = np.allclose(anew.noise, fitted.noise, rtol=_RENEWED)
+            if alike and fitted.exact == anew.exact:
+                break
+            fitted = anew
+        else:
+            fitted, last = towards(fitted, fitted.settled(chromosome), last)
     return _optimum(fitted, chromosome, rms)
 
 

@@ -163,7 +163,7 @@ class Tracer:
         gradient: FloatArray,
         quantity: Profiled,
     ) -> None:
-        objective, self.quantity = local.criterion, quantity
+        objective, self.quantity = local.nearby, quantity
         self.objective = objective
         self.start = objective.space.encode(local.chromosome)
         self.centre = quantity.at(self.start)

@@ -66,6 +66,13 @@ class Sensitivity:
         return self.slopes[:, self.objective.weights > 0.0].reshape(-1, len(self.chromosome))
 
     @cached_property
+    def nearby(self) -> Objective:
+        """The criterion for places around the chromosome."""
+        if isinstance(self.criterion, Innovations):
+            return self.criterion.around(self.chromosome)
+        return self.criterion
+
+    @cached_property
     def error(self) -> float:
         """What the criterion is at the chromosome."""
         return float(self.criterion.evaluate(self.chromosome[None])[0][0])

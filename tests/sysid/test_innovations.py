@@ -461,6 +461,21 @@ def test_inputs_are_averaged_where_their_noise_hides_a_bend_and_not_else():
     assert bent.averaged_inputs_ and not straight.averaged_inputs_
 
 
+def test_innovations_count_by_what_noise_does_to_them_at_a_bend():
+    """Of |u|: what is foreseen where u passes zero is uncertain, also of averages."""
+    record = slow_record(np.abs)
+    objective = Objective(BatchSimulator(BENT), SearchSpace.of(BENT), [record])
+    truth = np.array([GAIN, TAU])
+    averaged = Innovations.of(objective, np.array([0.005]), corrects=True, quiet=True)
+    doubting = averaged.doubting(truth)
+    size = np.abs(3.0 * np.sin(0.5 * np.arange(4000) * DT))
+    assert doubting.trust[0][size < 0.05].mean() < 0.9
+    assert doubting.trust[0][size > 1.5].min() > 0.999
+    # What was measured is taken in as before.
+    kept, counted = (f.residuals(truth[None], [4]).values[..., 0] for f in (averaged, doubting))
+    assert counted == pytest.approx(kept * doubting.trust[0], rel=1e-9, abs=1e-12)
+
+
 def test_intervals_are_those_of_the_averaged_inputs_that_were_fitted():
     record, noise = slow_record(np.abs), np.array([0.3])
     fit = GASSI(BENT, population=20, generations=8, criterion="innovations").fit(record)

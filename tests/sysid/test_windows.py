@@ -246,3 +246,10 @@ def test_a_filter_takes_no_parabolas_where_noise_does_not_cover_what_they_miss(n
     assert fitted.exact == exact
     left = fitted.residuals(p[None], np.array([4])).values[1:, 0, 0] * objective.scales[0]
     assert (np.abs(left).max() < 0.01) == exact
+    # Around a place they are known in proportion.
+    near, steps = p[None] * np.array([1.02, 1.05]), np.array([4])
+    parabolas = Innovations.of(objective, np.array([noise]), corrects=True)
+    known, there, off = (
+        by.residuals(near, steps).values for by in (fitted.around(p), fitted, parabolas)
+    )
+    assert np.abs(known - there).max() <= 0.02 * np.abs(off - there).max()
