@@ -253,3 +253,7 @@ def test_a_filter_takes_no_parabolas_where_noise_does_not_cover_what_they_miss(n
         by.residuals(near, steps).values for by in (fitted.around(p), fitted, parabolas)
     )
     assert np.abs(known - there).max() <= 0.02 * np.abs(off - there).max()
+    # A place where nothing rings does not speak for the other.
+    slow = np.array([1.0, 20.0 * DT])
+    assert not parabolas.rings_at(slow[None])
+    assert parabolas.rings_at(np.stack([slow, p])) == exact
