@@ -68,6 +68,7 @@ _OFF = 1.5
 _FEWEST = 2  # a sample, where a free run takes more
 _PART = 0.5  # of a deviation that steps of a free run may move any quantity by
 _MANY = 32  # a sample, with which no covariance bursts
+_NEARBY = 1e-3  # of the ranges: how far from a place slopes of averages' shape are told
 _BURST = 0.1  # of the innovations, by which steps of a free run may change them
 
 
@@ -242,7 +243,7 @@ class Innovations(Objective):
         if not self.exact:
             return self
         lower, upper = self.space.coded_bounds
-        at, distance = self.space.encode(chromosome), _MOVE * (upper - lower)
+        at, distance = self.space.encode(chromosome), _NEARBY * (upper - lower)
         coded = np.vstack([at, at + np.diag(distance), at - np.diag(distance)])
         chromosomes = self.space.decode(coded)
         vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
