@@ -24,7 +24,8 @@ from sysid.problem.space import SearchSpace
 _LENGTH = 1024  # samples of a part
 # Share of a part until what its start does not tell is forgotten: it is simulated, not compared.
 _RUN_IN = 0.25
-_REPEATED = 2048  # samples that tell enough where records repeat each other
+# Of records that repeat each other a quarter tells enough, of no fewer and no more samples.
+_PART, _REPEATED = 0.25, (2048, 4096)
 # Ratio of the mean squares of any combination of signals, of a record and those chosen, up to which
 # it repeats them.
 _ALIKE = 4.0
@@ -57,7 +58,8 @@ class Excerpt:
         total = sum(record.n_samples for record in records)
         if samples == 0:
             return None
-        chosen: Sequence[int] = _repeated(records, min(samples, _REPEATED))
+        part = int(np.clip(_PART * total, *_REPEATED))
+        chosen: Sequence[int] = _repeated(records, min(samples, part))
         if not chosen:
             if total <= 2 * samples:
                 return None
