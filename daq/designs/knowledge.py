@@ -12,7 +12,7 @@ from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError
 from daq.hal import ANALOG_INPUTS, FloatArray
 from daq.identification import stages
-from daq.logs.encoder import SPEED
+from daq.logs.encoder import SPEED, repeated
 from daq.logs.recording import Recording
 from sysid import ProcessModel, SearchSpace
 from sysid.experiments import Prior
@@ -151,8 +151,7 @@ def _between_turns(rate: FloatArray) -> npt.NDArray[np.bool_]:
     rows = np.flatnonzero(steps)
     turned = np.zeros(len(rows) + 1, dtype=bool)
     turned[1:-1] = steps[rows[1:]] * steps[rows[:-1]] < 0.0
-    repeated = turned & (np.roll(turned, 1) | np.roll(turned, -1))
-    return repeated[np.searchsorted(rows, np.arange(len(rate)))]
+    return repeated(turned)[np.searchsorted(rows, np.arange(len(rate)))]
 
 
 def require_calibrated(path: Path, log: Recording) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.hal import FloatArray, IntArray
 
@@ -94,8 +95,8 @@ class _Intervals:
         back = (np.abs(change) == 1.0) & (np.diff(change, prepend=np.nan) == 2.0 * change)
         # Of one turn after the other nothing tells how fast the shaft passed the edges.
         turns = rate == 0.0
-        repeated = turns & (np.append(False, turns[:-1]) | np.append(turns[1:], False))
-        measured = back & (_faster(rate) < 1.0) & (~repeated | (end - begin >= _REST))
+        lasting = ~repeated(turns) | (end - begin >= _REST)
+        measured = back & (_faster(rate) < 1.0) & lasting
         rate = np.where(turns & ~measured, np.nan, rate)
         return cls(rows, rate, begin, end, slack, len(timed), int(agreeing.sum()))
 
@@ -104,6 +105,14 @@ class _Intervals:
         if stated and self.checked < _MANY:
             return True
         return self.agreeing >= max(_FEWEST, _SHARE * self.checked)
+
+
+def repeated(turns: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Of turns of a shaft, (n,), those that have another next to them."""
+    again: npt.NDArray[np.bool_] = turns & (
+        np.append(False, turns[:-1]) | np.append(turns[1:], False)
+    )
+    return again
 
 
 def _faster(rate: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
 # Factor to the next accuracy where the errors of single steps add up, and the last accuracy.
-FINER, FINEST = 0.1, 1e-9
+_FINER, _FINEST = 0.1, 1e-9
 _PART = 0.5  # of a deviation by which errors of the steps may move any quantity
 _FAR_MORE = 16  # times the steps that a search took, above which they would cost too much
 
@@ -43,40 +43,61 @@ def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> 
         finer = simulator.trajectories(vector, record, twice, start[None])[0]
         error = np.sqrt(np.mean((finer - outputs) ** 2, axis=0))
         size = np.maximum(np.max(np.abs(finer), axis=0), 1e-300)
-        if not np.max(error / size) > accuracy or simulator.accuracy < FINEST:
+        if not np.max(error / size) > accuracy or simulator.accuracy < _FINEST:
             return outputs
-        simulator = simulator.finer(FINER * simulator.accuracy)
+        simulator = simulator.finer(_FINER * simulator.accuracy)
 
 
-def resolved(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Objective:
+def accurate(objective: Objective, chromosome: FloatArray) -> Objective:
+    """The objective with simulations as accurate as they are meant to be, at a chromosome.
+
+    The errors of single steps add up where little is damped; twice the steps show by how much.
+    """
+    accuracy = objective.simulator.accuracy
+    while objective.simulator.accuracy >= _FINEST:
+        steps = objective.steps_needed(chromosome[None])
+        change = _change_by_steps(objective, chromosome, steps)
+        if not np.max(np.sqrt(np.mean(change**2, axis=0))) > accuracy:
+            break
+        objective = objective.finer(_FINER * objective.simulator.accuracy)
+    return objective
+
+
+def fine_enough(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Objective:
     """The objective by as many steps as noise lets it tell, at a minimum (n_free,).
 
     rms: (n_outputs,), of the errors there, none of which is zero. Errors of the steps that a
     search goes by are small beside an output, but may be large beside its noise, as of an encoder.
     """
-    accurate, at = objective, chromosome[None]
-    first = last = objective.steps_needed(at)
+    first = last = objective.steps_needed(chromosome[None])
     changed = True
-    while accurate.simulator.accuracy > FINEST and last.max() < _FAR_MORE * first.max():
-        if changed and not _swayed(accurate, chromosome, last, rms):
-            return accurate
-        accurate = accurate.finer(FINER * accurate.simulator.accuracy)
-        steps = accurate.steps_needed(at)
+    while objective.simulator.accuracy > _FINEST and last.max() < _FAR_MORE * first.max():
+        if changed and not _swayed(objective, chromosome, last, rms):
+            break
+        objective = objective.finer(_FINER * objective.simulator.accuracy)
+        steps = objective.steps_needed(chromosome[None])
         changed, last = bool(np.any(steps != last)), steps
-    return accurate
+    return objective
 
 
 def _swayed(objective: Objective, chromosome: FloatArray, steps: IntArray, rms: FloatArray) -> bool:
     """Whether errors of so many steps (1, n_records) move a quantity noticeably."""
 
-    def in_noise(chromosomes: FloatArray, times: int = 1) -> FloatArray:
-        taken = np.repeat(times * steps, len(chromosomes), axis=0)
+    def in_noise(chromosomes: FloatArray) -> FloatArray:
+        taken = np.repeat(steps, len(chromosomes), axis=0)
         return objective.residuals(chromosomes, taken).values / rms[:, None]
 
-    change = (in_noise(chromosome[None]) - in_noise(chromosome[None], 2))[..., 0]
+    change = _change_by_steps(objective, chromosome, steps) / rms
     if not np.linalg.norm(change) > _PART:
         return False
     return moved_by(change, in_noise, objective.space, chromosome) > _PART
+
+
+def _change_by_steps(objective: Objective, chromosome: FloatArray, steps: IntArray) -> FloatArray:
+    """Residuals (n_residuals, n_outputs) by steps (1, n_records) less those by twice as many."""
+    few, many = (objective.residuals(chromosome[None], n).values for n in (steps, 2 * steps))
+    change: FloatArray = (few - many)[..., 0]
+    return change
 
 
 def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:

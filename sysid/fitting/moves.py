@@ -25,8 +25,17 @@ def moved_by(
     at = space.encode(chromosome)
     inwards = np.where(at < 0.5 * (lower + upper), _STEP, -_STEP) * (upper - lower)
     values = in_noise(space.decode(np.vstack([at, at + np.diag(inwards)])))
-    slopes = (values[..., 1:] - values[..., :1]).reshape(-1, len(chromosome))
-    lengths = np.linalg.norm(slopes, axis=0)
+    return float(np.linalg.norm(directions(values[..., 1:] - values[..., :1]).T @ change.ravel()))
+
+
+def directions(slopes: FloatArray) -> FloatArray:
+    """Orthonormal changes of the residuals, (n, rank), that parameters make up for.
+
+    slopes: (n_residuals, n_outputs, n_free), in parts of the noise. What a change has along these
+    is by how many standard deviations it moves the combinations of parameters that make them.
+    """
+    columns = slopes.reshape(-1, slopes.shape[2])
+    lengths = np.linalg.norm(columns, axis=0)
     felt = np.isfinite(lengths) & (lengths > 0.0)
-    directions, _ = np.linalg.qr(slopes[:, felt] / lengths[felt])
-    return float(np.linalg.norm(directions.T @ change.ravel()))
+    orthonormal: FloatArray = np.linalg.qr(columns[:, felt] / lengths[felt])[0]
+    return orthonormal

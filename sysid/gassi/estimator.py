@@ -465,7 +465,8 @@ class GASSI(RecordEstimator):
         if self.model is None:
             raise ModelError("GASSI needs a process model: GASSI(model)")
         starts = getattr(self, "estimated_starts_", ())
-        return self.model.with_initial(dict.fromkeys(starts, "estimate"))
+        # Kernels are looked up by the model, which is quick for the same one.
+        return self.model.with_initial(dict.fromkeys(starts, "estimate")) if starts else self.model
 
     def simulator(self) -> BatchSimulator:
         """The model's simulator, by the estimator's settings."""

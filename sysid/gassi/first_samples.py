@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.fitting.moves import directions
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
@@ -29,12 +30,10 @@ def noticed_starts(
     local, names = sensitivity(objective, chromosome), objective.simulator.model.state_names
     noise = np.sqrt(np.mean(local.residual**2, axis=0))
     noise = np.where(noise > 0.0, noise, np.inf)
-    slopes = (local.slopes / noise[:, None]).reshape(-1, local.slopes.shape[2])
-    lengths = np.linalg.norm(slopes, axis=0)
-    directions, _ = np.linalg.qr(slopes[:, lengths > 0.0] / lengths[lengths > 0.0])
+    made_up_for = directions(local.slopes / noise[:, None])
     squares = np.zeros(len(names))
     for state, change in start_errors(local):
-        squares[state] += np.sum((directions.T @ (change / noise).ravel()) ** 2)
+        squares[state] += np.sum((made_up_for.T @ (change / noise).ravel()) ** 2)
     noticed = (names[i] for i in np.flatnonzero(squares > _NOTICEABLE**2))
     return tuple(name for name in noticed if name not in kept)
 

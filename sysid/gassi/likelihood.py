@@ -19,7 +19,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import TOLERANCE, Point, Restriction
-from sysid.fitting.free_run import FINER, FINEST, resolved
+from sysid.fitting.free_run import accurate, fine_enough
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
@@ -103,7 +103,7 @@ def fit_likelihood(
     innovations, too, where free runs would not do. process: as of ``Innovations``. explored:
     whether the minima have their lookalikes among them.
     """
-    objective = _resolved(objective, minima[0])
+    objective = accurate(objective, minima[0])
     # A filter begins at the minima of free runs, and does not end there; what looks like a minimum
     # it tells itself.
     roughly = noise == "innovations"
@@ -329,29 +329,13 @@ def _in_noise(
     """Minima anew by as many steps as the best one's errors let the data tell, if by more."""
     best, *others = optima.ranked()
     rms = np.maximum(best.rms, max(_LEAST_SHARE * best.rms.max(), _TINY))
-    finer = resolved(best.objective, best.chromosome, rms)
+    finer = fine_enough(best.objective, best.chromosome, rms)
     if finer is best.objective:
         return objective, optima
     near = (optimum for optimum in others if optima.deviance(optimum, best) < _CONCEIVABLE)
     minima = _chromosomes([best, *near])
     objective = objective.finer(finer.simulator.accuracy)
     return objective, _explored(objective, minima, watch, lookalike=False)
-
-
-def _resolved(objective: Objective, chromosome: FloatArray) -> Objective:
-    """The objective with simulations as accurate as they are meant to be, at a chromosome.
-
-    The errors of single steps add up where little is damped; twice the steps show by how much.
-    """
-    accuracy = objective.simulator.accuracy
-    while objective.simulator.accuracy >= FINEST:
-        steps = objective.steps_needed(chromosome[None])[0]
-        coarse = objective.residuals(chromosome[None], steps).values
-        change = coarse - objective.residuals(chromosome[None], 2 * steps).values
-        if not np.max(np.sqrt(np.mean(change**2, axis=0))) > accuracy:
-            break
-        objective = objective.finer(FINER * objective.simulator.accuracy)
-    return objective
 
 
 def _weighed(
