@@ -14,6 +14,7 @@ from daq.cli import terminal
 
 if TYPE_CHECKING:
     from daq.identification.comparison import ComparisonResult, SeedsResult
+    from daq.identification.draft import Draft
     from daq.identification.result import Identification
     from daq.identification.rows import (
         OutputErrors,
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
         RivalRow,
         Rows,
     )
-    from daq.report.draft import Draft
     from sysid import Campaign
     from sysid.judging.comparison import Comparison, Row
     from sysid.uncertainty import Profile
@@ -65,7 +65,7 @@ def drafting(report: bool) -> Iterator[Draft | None]:
     if not report:
         yield None
         return
-    from daq.report.draft import Draft
+    from daq.identification.draft import Draft
 
     with Draft() as draft:
         yield draft

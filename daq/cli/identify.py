@@ -78,8 +78,7 @@ def identify(
             )
         with drafting(report) as draft:
             with terminal.watching(json) as watch:
-                begin = draft.begin if draft else None
-                result = fit.resume(resume, watch, trust=trust, loaded=begin)
+                result = fit.resume(resume, watch, trust=trust, draft=draft)
             _finish(show_identification(result, report, json, draft=draft), json)
         return
     if not logs:
@@ -111,8 +110,7 @@ def identify(
     request = replace(request, options={**chosen, "model": model[0] if model else None})
     with drafting(report) as draft:
         with terminal.watching(json) as watch:
-            begin = draft.begin if draft else None
-            result = fit.identify_files(logs, validate or [], request, out, watch, begin)
+            result = fit.identify_files(logs, validate or [], request, out, watch, draft)
         _finish(show_identification(result, report, json, draft=draft), json)
 
 

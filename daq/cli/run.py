@@ -70,9 +70,8 @@ def _identify(problem: Problem, result: SessionResult, report: bool, json: bool)
     folder = result.run.folder / "identification"
     with drafting(report) as draft:
         with terminal.watching(json) as watch, heeded():
-            begin = draft.begin if draft else None
             runs = [result.run.folder]
-            identification = fit(problem, runs, validation, folder, watch, loaded=begin)
+            identification = fit(problem, runs, validation, folder, watch, draft=draft)
         return show_identification(identification, report, json, draft=draft)
 
 

@@ -34,13 +34,12 @@ from sysid.problem.faults import DataFault, Part, after_mending, data_faults
 if TYPE_CHECKING:
     import pandas as pd
 
+    from daq.identification.draft import Draft, Missing
     from sysid.gassi import GASSI
     from sysid.gassi import Progress as SearchProgress
     from sysid.uncertainty import Uncertainty
 
     Source = str | Path | Recording | pd.DataFrame
-
-Loaded = Callable[[Problem, Split], None]
 
 _COPY = 0.99  # of a log's samples that stand in another as well
 
@@ -86,16 +85,16 @@ def identify_files(
     settings: SettingsRequest,
     out: Path | None,
     watch: Watch = ignore,
-    loaded: Loaded | None = None,
+    draft: Draft | None = None,
 ) -> Identification:
     """Identify and write the results into ``out``, or else beside the log.
 
-    loaded: as of ``fit``. Raises ConfigError before anything is computed, with cause and cure.
+    draft: as of ``fit``. Raises ConfigError before anything is computed, with cause and cure.
     """
     problem = problem_of(settings, watch, logs=[*logs, *validate])
     folder = out or default_folder(logs, problem.model.name)
     check_writable(folder)
-    return fit(problem, logs, validate, folder, watch, loaded=loaded)
+    return fit(problem, logs, validate, folder, watch, draft=draft)
 
 
 def resume(
@@ -103,12 +102,12 @@ def resume(
     watch: Watch = ignore,
     *,
     trust: bool = False,
-    loaded: Loaded | None = None,
+    draft: Draft | None = None,
 ) -> Identification:
     """Continue an identification that was interrupted, as it was requested.
 
     folder: of its results, or the capture folder above. trust: run the Python file of a model that
-    the request names. loaded: as of ``fit``. Raises ConfigError without such a one.
+    the request names. draft: as of ``fit``. Raises ConfigError without such a one.
 
     >>> resume("runs")
     Traceback (most recent call last):
@@ -116,7 +115,7 @@ def resume(
     """
     place, settings, training, validation = request.recall(Path(folder))
     problem = problem_of(settings, watch, record=None if trust else place / request.FILE)
-    return fit(problem, training, validation, place, watch, resume=True, loaded=loaded)
+    return fit(problem, training, validation, place, watch, resume=True, draft=draft)
 
 
 def fit(
@@ -127,15 +126,13 @@ def fit(
     watch: Watch = ignore,
     resume: bool = False,
     examine: Callable[[Identification], bool] = lambda result: True,
-    loaded: Loaded | None = None,
+    draft: Draft | None = None,
 ) -> Identification:
     """Fit a problem that has been checked to logs.
 
     folder: for ``parameters.yaml``, and while the search runs for what it takes to continue it.
     resume: continue from there. examine: whether what the model may lack is to be tested, which
-    may take longer than the fit. loaded: is given the problem and the logs, before these are looked
-    at.
-    Raises ConfigError.
+    may take longer than the fit. draft: what else can be done meanwhile. Raises ConfigError.
     """
     train, check = load_logs(problem, training, validation)
     warn(watch, *(log.warning for log in (*train, *check)))
@@ -145,8 +142,8 @@ def fit(
     train, ends = records.hold_back(train, problem.settings.hold_back)
     _require_information(problem, train)
     logs = train, [*ends, *check]
-    if loaded is not None:
-        loaded(problem, logs)
+    if draft is not None:
+        draft.begin(problem, logs)
     faults = faults_of(problem, logs)
     for fault in faults:
         watch(Note("warning" if fault.severity == "doubt" else "note", fault.sentence))
@@ -157,9 +154,11 @@ def fit(
         problem = problem.starting(estimator.estimated_starts_)
         for name in estimator.estimated_starts_:
             watch(Note("note", _STARTED.format(name)))
+        datasets = [log.dataset for log in train]
+        missing = draft.score_tests(problem, estimator, datasets) if draft is not None else None
         result = assemble(problem, estimator, logs, folder, watch, faults)
         if examine(result):
-            result = examined(result, logs, watch)
+            result = examined(result, logs, watch, missing)
     except (KeyboardInterrupt, Terminated) as stop:
         if folder is not None and (folder / request.CHECKPOINT).exists():
             command = request.resume_command(folder) + trust_option(problem.model_name)
@@ -307,13 +306,18 @@ def assemble(
     return Identification(problem, estimator, uncertainty, *parts, faults=faults)
 
 
-def examined(result: Identification, logs: Split, watch: Watch) -> Identification:
-    """With what the model may lack tested, and the surest variant fitted."""
+def examined(
+    result: Identification, logs: Split, watch: Watch, missing: Missing | None = None
+) -> Identification:
+    """With what the model may lack tested, and the surest variant fitted.
+
+    missing: as of ``suspected``.
+    """
     from sysid.judging.examination import suspected
 
     watch(Progress("Verdict", 0, 1, "what the model may lack"))
-    datasets_of = [[log.dataset for log in part] for part in logs]
-    suspicion = suspected(result.estimator, result.uncertainty, *datasets_of)
+    training, validation = ([log.dataset for log in part] for part in logs)
+    suspicion = suspected(result.estimator, result.uncertainty, training, validation, missing)
     watch(Progress("Verdict", 1, 1, "what the model may lack"))
     return replace(result, suspicion=suspicion)
 

@@ -14,17 +14,17 @@ from daq.documents import plain
 from daq.figures import style
 from daq.files import digest, make_folder, write_whole
 from daq.identification.baseline import Baseline
+from daq.identification.draft import Draft
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import PARAMETERS, SettingsRequest
 from daq.identification.result import Identification, errors_document
 from daq.logs.recording import read_record, settings_of
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
-from daq.report.draft import Draft
 from daq.report.latex import latex, latex_errors
 from daq.report.page import Drawing, Picture, page
 from daq.report.pictures import Subject, pictures
-from daq.report.second_process import Job, SecondProcess, done
+from daq.second_process import Job, SecondProcess, done
 
 DATA, FIGURES = "report.json", "figures"
 _PAGE, _TABLE = "report.html", "parameters.tex"

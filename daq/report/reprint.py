@@ -17,7 +17,7 @@ from daq.identification.settings import reading_of
 from daq.progress import Progress, Watch, ignore
 from daq.report.pictures import Subject, pictures
 from daq.report.publication import DATA, FIGURES, draw
-from daq.report.second_process import SecondProcess
+from daq.second_process import SecondProcess
 from sysid import BatchSimulator, ProcessModel, free_run
 
 _AGAIN = "identify again to have a report of it"

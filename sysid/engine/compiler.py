@@ -82,12 +82,6 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
     return Kernels(model, batch, trajectory, *_compiled(model, text, called, functions))
 
 
-def is_compiled(model: ProcessModel) -> bool:
-    """Whether machine code of a model's kernels lies in the cache folder, or there can be none."""
-    first: Any = kernels(model).spectrum
-    return bool(getattr(first._cache, "is_filled", True))
-
-
 @dataclass(frozen=True)
 class Filter:
     """A model's compiled extended Kalman filter."""
@@ -318,11 +312,6 @@ def _cache_of(function: Any) -> Any:
         def save_overload(self, sig: Any, data: Any) -> None:
             with contextlib.suppress(OSError):
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-
-        @property
-        def is_filled(self) -> bool:
-            """Whether there is machine code."""
-            return bool(self._cache_file._load_index())  # type: ignore[no-untyped-call]
 
     return Cache(function)  # type: ignore[no-untyped-call]
 

@@ -416,6 +416,21 @@ class GASSI(RecordEstimator):
 
         X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``.
         """
+        fitted = self._fitted_objective(X, y, records)
+        if isinstance(fitted, Innovations):
+            return fitted.doubting(self.chromosome_).eased(self.chromosome_)
+        return fitted
+
+    def final_free_run(
+        self, X: Data, y: FloatArray | None = None, records: Any = None
+    ) -> Objective:
+        """The objective of the free run's errors, by the weights with which ``fit`` ended.
+
+        X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``.
+        """
+        return self._fitted_objective(X, y, records).free_run
+
+    def _fitted_objective(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
         self._check_fitted()
         if not PRESETS[self.preset].refine:
             raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
@@ -425,7 +440,7 @@ class GASSI(RecordEstimator):
         objective = self._at_final_accuracy(self._objective(data).weighed(self.output_weights_))
         if self.output_noise_ is None:
             return objective
-        fitted = Innovations.of(
+        return Innovations.of(
             objective,
             self.output_noise_,
             corrects=self.criterion_ == "innovations",
@@ -433,7 +448,6 @@ class GASSI(RecordEstimator):
             quiet=self.averaged_inputs_,
             near=self.chromosome_,
         )
-        return fitted.doubting(self.chromosome_).eased(self.chromosome_)
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""

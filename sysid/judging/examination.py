@@ -1,6 +1,6 @@
 """All that a verdict rests on, of a fitted estimator: runs and their tests, what is missing."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from sysid.arrays import FloatArray
@@ -13,7 +13,7 @@ from sysid.judging.assessment import RecordResult, Verdict, examine, judge
 from sysid.judging.exchanges import exchanged_channels
 from sysid.judging.expected_errors import expected_errors
 from sysid.judging.lags import lag_faults
-from sysid.judging.score_tests import Finding, missing_physics
+from sysid.judging.score_tests import Finding, ScoreTests, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import data_faults
@@ -91,21 +91,25 @@ def suspected(
     uncertainty: Uncertainty | None,
     training: Sequence[Dataset],
     validation: Sequence[Dataset] = (),
+    missing: Callable[[Uncertainty], tuple[Finding, ...]] | None = None,
 ) -> Suspicion | None:
     """What the model may lack by the training records; None where that cannot be tested.
 
-    validation: on which a variant that is fitted must do no worse.
+    validation: on which a variant that is fitted must do no worse. missing: the findings of
+    ``score_tests_of``, where these have been begun elsewhere.
     """
     if uncertainty is None:
         return None
     try:
-        objective, chromosome = estimator.final_objective(list(training)), estimator.chromosome_
         tested = uncertainty
         if any(p.pushed for p in uncertainty.parameters):
             # What an end of a range leaves looks like something missing.
-            objective, chromosome = _freed(objective, chromosome)
-            tested = intervals(objective, chromosome)
-        findings = missing_physics(objective, chromosome, tested)
+            freed = _freed(estimator.final_objective(list(training)), estimator.chromosome_)
+            tested = intervals(*freed)
+            findings = missing_physics(*freed, tested)
+        else:
+            missing = missing or score_tests_of(estimator, training).findings
+            findings = missing(tested)
     except ModelError:  # equations that cannot be added to, or a run that fails
         return None
     findings = tuple(
@@ -116,6 +120,14 @@ def suspected(
         return Suspicion((exchange,), None)  # what else is found is of the wrong channels
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
     return Suspicion(findings, fitted)
+
+
+def score_tests_of(estimator: GASSI, training: Sequence[Dataset]) -> ScoreTests:
+    """Tests of what the model may lack where a fit to the training records ended.
+
+    Raises ModelError for equations that cannot be added to, and a run that fails.
+    """
+    return ScoreTests(estimator.final_free_run(list(training)), estimator.chromosome_)
 
 
 def _freed(objective: Objective, chromosome: FloatArray) -> tuple[Objective, FloatArray]:

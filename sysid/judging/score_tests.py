@@ -18,8 +18,10 @@ the smallest probability is taken into the regression, and the rest asked again.
 
 import math
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -149,24 +151,51 @@ def missing_physics(
     Faults of channels and the model's variants are tried before functions in the equations.
     Raises ModelError where the free run at the chromosome fails.
     """
-    model = objective.simulator.model
-    records = head(objective.records, _MOST_SAMPLES)
-    local = sensitivity(objective.free_run.on(records), chromosome)
-    if np.max(np.sqrt(np.mean(local.residual**2, axis=0))) < objective.simulator.accuracy:
-        return ()  # what is left is the simulation's
-    runs = _runs(local)
-    noisy = [model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
-    channels = list(channel_suspects(runs))
-    # Noise of an input makes its gain look smaller: that is no fault.
-    channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
-    foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
-    tests = _Tests(local, uncertainty, foreseen, _noisy_starts(runs, local), runs[0].workers)
-    alone = [e.name for e in uncertainty.determined() if e.name in model.parameter_names]
-    channels += in_single_records([s for s in channels if s.kind != "noise"], runs)
-    tests.admit([*channels, *variant_suspects(runs), *change_suspects(runs, alone)])
-    if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
-        tests.admit([*function_suspects(runs), *disturbance_suspects(runs)])
-    return tests.settled()
+    return ScoreTests(objective, chromosome).findings(uncertainty)
+
+
+class ScoreTests:
+    """Tests at a minimum, (n_free,), with all that they take but the parameters' intervals.
+
+    objective: of the free run's errors, or whose ``free_run`` is. Raises ModelError where the free
+    run fails.
+    """
+
+    def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
+        records = head(objective.records, _MOST_SAMPLES)
+        local = sensitivity(objective.free_run.on(records), chromosome)
+        # Smaller errors than those of the simulation are these.
+        left = np.max(np.sqrt(np.mean(local.residual**2, axis=0)))
+        self._exact = bool(left < objective.simulator.accuracy)
+        if self._exact:
+            return
+        self._runs = runs = _runs(local)
+        noisy = [runs[0].model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
+        channels = list(channel_suspects(runs))
+        # Noise of an input makes its gain look smaller: that is no fault.
+        channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
+        foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
+        self._tests = _Tests(local, foreseen, _noisy_starts(runs, local), runs[0].workers)
+        channels += in_single_records([s for s in channels if s.kind != "noise"], runs)
+        self._named = [*channels, *variant_suspects(runs)]
+
+    @cached_property
+    def functions(self) -> list[Suspect]:
+        """Functions in the equations, for which there may be no need."""
+        if self._exact:
+            return []
+        return [*function_suspects(self._runs), *disturbance_suspects(self._runs)]
+
+    def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
+        """What the model lacks, the surest first, and how far it moves what has intervals."""
+        if self._exact:
+            return ()
+        names, tests = self._runs[0].model.parameter_names, self._tests.of(uncertainty)
+        alone = [e.name for e in uncertainty.determined() if e.name in names]
+        tests.admit([*self._named, *change_suspects(self._runs, alone)])
+        if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
+            tests.admit(self.functions)
+        return tests.settled()
 
 
 def _runs(local: Sensitivity) -> list[DisturbedRun]:
@@ -238,24 +267,20 @@ class _Tests:
     Columns are (n_residuals, n_outputs, k), in parts of the outputs' scales.
     """
 
+    findings: list[Finding]
+    _ends: list[int]
+    _estimates: list[Estimate]
+    _gradients: FloatArray
+
     def __init__(
-        self,
-        local: Sensitivity,
-        uncertainty: Uncertainty,
-        foreseen: FloatArray,
-        chance: FloatArray,
-        workers: Workers,
+        self, local: Sensitivity, foreseen: FloatArray, chance: FloatArray, workers: Workers
     ) -> None:
         """Of changes that are there whatever is missing, (n_residuals, n_outputs, k) each.
 
         foreseen: of any size. chance: by one standard deviation of what is known to be so large.
         """
-        self.findings: list[Finding] = []
         self._workers = workers
         self._local, self._residual = local, -local.residual
-        self._estimates = [e for e in uncertainty.determined() if e.deviation]
-        gradients = [_gradient(local, e) for e in self._estimates]
-        self._gradients = np.array(gradients).reshape(-1, local.slopes.shape[2])
         self._scales = np.concatenate(
             [
                 np.broadcast_to(scale, (n, len(scale)))
@@ -274,9 +299,18 @@ class _Tests:
                 np.zeros(foreseen.shape[2]),
             ]
         )
-        self._ends = [self._columns.shape[2]]  # of the columns until each finding
         self._noises = list(input_noises(local))
         self._regression = self._coloured_by(self._residual)
+
+    def of(self, uncertainty: Uncertainty) -> Self:
+        """The same, before any suspect is admitted, of what has intervals."""
+        tests = copy(self)
+        tests.findings = []
+        tests._ends = [self._columns.shape[2]]  # of the columns until each finding
+        tests._estimates = [e for e in uncertainty.determined() if e.deviation]
+        gradients = [_gradient(self._local, e) for e in tests._estimates]
+        tests._gradients = np.array(gradients).reshape(-1, self._local.slopes.shape[2])
+        return tests
 
     def admit(self, suspects: Sequence[Suspect]) -> None:
         """Admit the suspects that are there by more than chance, each given those before it."""
@@ -547,13 +581,11 @@ class _Regression:
 
     def _pushes(self, left: FloatArray) -> FloatArray:
         """Changes of the score by draws of the inputs' noise, (k, n_draws of all records)."""
-        return np.hstack([left[places].T @ noise for places, noise in self._white_noises])
-
-    @cached_property
-    def _white_noises(self) -> list[tuple[slice, FloatArray]]:
-        """Whitened rows of each record, and the changes of its residuals by draws of the noise."""
-        whitening = self.whitening
-        return [(whitening.rows_of(r), whitening.of_record(r, noise)) for r, noise in self._noises]
+        pushes = []
+        for rows, noise in self._noises:
+            back = self.whitening.back(rows, left)
+            pushes.append(back.T @ noise.reshape(len(back), -1))
+        return np.hstack(pushes)
 
 
 class _Basis:
@@ -717,6 +749,22 @@ class _Whitening:
         white: FloatArray = (self._filter @ past)[self.kept[rows][order:]]
         whole[:, felt] = white.reshape(len(whole), -1)
         return whole
+
+    def back(self, rows: slice, white: FloatArray) -> FloatArray:
+        """Of columns' products with whitened ones (n_rows, k) what these are with any, of a record.
+
+        Its transpose: (n_samples * n_outputs, k), by the record's rows of the residuals.
+        """
+        q, order = self.n_outputs, len(self.model.coefficients)
+        kept = self.kept[rows]
+        whole = np.zeros((len(kept), white.shape[1], q))
+        whole[kept] = white[self.rows_of(rows)].reshape(-1, q, white.shape[1]).swapaxes(1, 2)
+        pieces = whole[order:] @ self._filter  # (n_samples - order, k, (order + 1) q)
+        back = np.zeros_like(whole)
+        for lag in range(order + 1):
+            back[lag : lag + len(pieces)] += pieces[..., lag * q : (lag + 1) * q]
+        flat: FloatArray = back.swapaxes(1, 2).reshape(len(kept) * q, -1)
+        return flat
 
     def rows_of(self, rows: slice) -> slice:
         """Rows of the whitened columns of one record, by its rows of the residuals."""

@@ -18,9 +18,7 @@ from typing import IO, Any, Generic, Self, TypeVar, cast
 from sysid.threads import available_cores
 
 # It imports from where this one does, whatever folder it is in.
-_START = (
-    "import sys; sys.path[:] = sys.argv[1:]; from daq.report.second_process import serve; serve()"
-)
+_START = "import sys; sys.path[:] = sys.argv[1:]; from daq.second_process import serve; serve()"
 
 Result = TypeVar("Result")
 
@@ -37,6 +35,11 @@ class Job(Generic[Result]):
     def pending(self) -> bool:
         """Whether the other process has not answered yet."""
         return self.answer is not None and not self.answer.done()
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the other process has taken it on, and is done with it."""
+        return self.answer is not None and self.answer.done()
 
     def result(self) -> Result:
         """What the function returns: of the other process, or if that has ended of this one."""

@@ -1,0 +1,133 @@
+"""What a second process does of an identification and of its report, while the first goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import pickle
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Self
+
+from daq.identification.baseline import Baseline, LinearData, baselines_of
+from daq.identification.records import Split
+from daq.identification.settings import Problem, problem_of
+from daq.second_process import Job, SecondProcess
+from sysid import Dataset, ProcessModel
+from sysid.threads import one_thread
+
+if TYPE_CHECKING:
+    from sysid.gassi import GASSI
+    from sysid.judging.score_tests import Finding, ScoreTests
+    from sysid.uncertainty import Uncertainty
+
+    Missing = Callable[[Uncertainty], tuple[Finding, ...]]
+
+
+class Draft:
+    """An identification's second process; ends with its context."""
+
+    def __init__(self) -> None:
+        self.second = SecondProcess()
+        self._linear: Job[list[Baseline] | str] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.second.__exit__()
+
+    def begin(self, problem: Problem, logs: Split) -> None:
+        """Have that compiled or loaded which is wanted after the search, and baselines fitted."""
+        request = pickle.dumps(problem.request)
+        self.second.call(_compiled_ahead, request, logs[0][0].dataset)
+        self._linear = self.second.call(baselines_of, LinearData.of(problem.model, *logs))
+
+    def baselines(self, model: ProcessModel, logs: Split) -> list[Baseline] | str:
+        """Those of the logs, or why there are none."""
+        if self._linear is None:
+            return baselines_of(LinearData.of(model, *logs))
+        return self._linear.result()
+
+    def score_tests(
+        self, problem: Problem, estimator: GASSI, training: Sequence[Dataset]
+    ) -> Missing:
+        """Have tests of what the model may lack begun where a fit ended; what gives the findings.
+
+        Where the other process has something left to do they are left to this one.
+        """
+        from sysid.judging.examination import score_tests_of
+
+        def here(uncertainty: Uncertainty) -> tuple[Finding, ...]:
+            return score_tests_of(estimator, training).findings(uncertainty)
+
+        if self._linear is None or not self._linear.is_answered:
+            return here
+        fit = pickle.dumps(problem.request), _without_models((estimator, list(training)))
+        begun = self.second.call(_begun, *fit)
+
+        def findings(uncertainty: Uncertainty) -> tuple[Finding, ...]:
+            if not begun.result():
+                return here(uncertainty)
+            return self.second.call(_findings, *fit, uncertainty).result()
+
+        return findings
+
+
+def _compiled_ahead(request: bytes, record: Dataset) -> None:
+    from sysid.judging.ahead import compile_ahead
+
+    with contextlib.suppress(Exception):  # whatever is wrong is said where it is wanted
+        compile_ahead(_model(request), record)
+
+
+@lru_cache(maxsize=1)  # its kernels are found by the model
+def _model(request: bytes) -> ProcessModel:
+    return problem_of(pickle.loads(request)).model
+
+
+@one_thread()
+def _begun(request: bytes, fit: bytes) -> bool:
+    with contextlib.suppress(Exception):  # the same
+        return _score_tests(request, fit).functions is not None  # which there may be a need for
+    return False
+
+
+@one_thread()
+def _findings(request: bytes, fit: bytes, uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    return _score_tests(request, fit).findings(uncertainty)
+
+
+@lru_cache(maxsize=1)
+def _score_tests(request: bytes, fit: bytes) -> ScoreTests:
+    from sysid.judging.examination import score_tests_of
+
+    estimator, training = _WithModel(fit, _model(request)).load()
+    estimator.threads = 1  # the other cores are for the first process
+    return score_tests_of(estimator, training)
+
+
+class _WithoutModels(pickle.Pickler):
+    """Writes what holds a model, which may have functions that nothing else knows."""
+
+    def persistent_id(self, value: Any) -> str | None:
+        """A word for the model, wherever it is met."""
+        return "model" if isinstance(value, ProcessModel) else None
+
+
+class _WithModel(pickle.Unpickler):
+    """Reads that, with the model that was made anew."""
+
+    def __init__(self, content: bytes, model: ProcessModel) -> None:
+        super().__init__(io.BytesIO(content))
+        self._model = model
+
+    def persistent_load(self, _: Any) -> ProcessModel:
+        """The model."""
+        return self._model
+
+
+def _without_models(value: Any) -> bytes:
+    content = io.BytesIO()
+    _WithoutModels(content).dump(value)
+    return content.getvalue()
