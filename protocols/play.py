@@ -90,8 +90,9 @@ class Play(OpenLoop):
             wanted = " or ".join(", ".join(names) for names in _COLUMNS)
             raise ConfigError(f"{path}: its columns are {', '.join(present)}; name them {wanted}")
         cure = "a command must stand in every row; mend them"
-        frame, first, torn = read_table(path, names, cure)
-        n = len(frame)
+        table, first, torn = read_table(path, names, cure)
+        time, *commands = (table[name] for name in names)
+        n = len(time)
         if torn:
             raise ConfigError(
                 f"{path}:{first + n}: the last line has no end, so it may have been cut; complete "
@@ -99,7 +100,6 @@ class Play(OpenLoop):
             )
         if n < 2:
             raise ConfigError(f"{path}: it holds {n} row{'s' * (n != 1)}; at least 2 are needed")
-        time, *commands = (frame[name].to_numpy() for name in names)
         stuck = ~(np.diff(time) > 0.0)
         if stuck.any():
             raise ConfigError(

@@ -67,15 +67,13 @@ def _overlays(root: Path, entries: Sequence[RunEntry], watch: Watch) -> list[Ove
         watch(
             Note("note", f"signals of the last {_MOST_LINES} of {len(entries)} runs are drawn only")
         )
-    frames = {entry.folder: load(root / entry.folder).frame for entry in entries[-_MOST_LINES:]}
+    drawn = entries[-_MOST_LINES:]
+    columns_of = {entry.folder: load(root / entry.folder).columns for entry in drawn}
     return [
         Overlay(
             signal,
             UNITS[signal],
-            {
-                name: (frame["t"].to_numpy(), frame[signal].to_numpy())
-                for name, frame in frames.items()
-            },
+            {folder: (columns["t"], columns[signal]) for folder, columns in columns_of.items()},
         )
         for signal in _SIGNALS
     ]

@@ -58,9 +58,9 @@ def _export_log(log: Path, out: Path | None, kind: str, json: bool) -> None:
     if recording.warning:
         terminal.report("warning", recording.warning)
     if json:
-        terminal.print_json({"file": file, "format": kind, "samples": len(recording.frame)})
+        terminal.print_json({"file": file, "format": kind, "samples": recording.n_samples})
         return
-    print(f"Written: {file} ({len(recording.frame)} samples)")
+    print(f"Written: {file} ({recording.n_samples} samples)")
 
 
 def export_fmu(

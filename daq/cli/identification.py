@@ -65,10 +65,12 @@ def drafting(report: bool) -> Iterator[Draft | None]:
     if not report:
         yield None
         return
-    from daq.identification.draft import Draft
+    from daq.second_process import SecondProcess
 
-    with Draft() as draft:
-        yield draft
+    with SecondProcess() as second:
+        from daq.identification.draft import Draft  # while that begins
+
+        yield Draft(second)
 
 
 def _publish(result: Identification, json: bool, draft: Draft | None) -> dict[str, str]:

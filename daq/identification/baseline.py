@@ -82,18 +82,36 @@ def baselines_of(data: LinearData) -> list[Baseline] | str:
     There are none for logs too short, too long for the time that a report may take, or of several
     sample times.
     """
+    return joined(of_inputs(data), of_regressors(data))
+
+
+def joined(plain: list[Baseline] | str, extended: list[Baseline] | str) -> list[Baseline] | str:
+    """Those of ``of_inputs`` and of ``of_regressors`` in the order of ``baselines_of``."""
+    if isinstance(plain, str):
+        return plain
+    return extended if isinstance(extended, str) else [*plain[:1], *extended, *plain[1:]]
+
+
+def of_inputs(data: LinearData) -> list[Baseline] | str:
+    """The baselines that have the model's inputs, or why there are none."""
     if data.lacking:
         return data.lacking
     try:
-        baselines = [_tuned("OE", *data.records)]
-        if data.regressors:
-            extended = _tuned("OE, more inputs", *data.extended)
-            baselines.append(replace(extended, inputs=data.regressors))
-        if data.records[1]:
-            baselines.append(_in_hindsight(baselines[0], data.records[1]))
+        chosen = _tuned("OE", *data.records)
+        validated = data.records[1]
+        return [chosen, _in_hindsight(chosen, validated)] if validated else [chosen]
     except ModelError as error:
         return str(error)
-    return baselines
+
+
+def of_regressors(data: LinearData) -> list[Baseline] | str:
+    """The baseline that has the model's regressors as well, if there are any."""
+    if not data.regressors:
+        return []
+    try:
+        return [replace(_tuned("OE, more inputs", *data.extended), inputs=data.regressors)]
+    except ModelError as error:
+        return str(error)
 
 
 def refitted(

@@ -7,9 +7,16 @@ import io
 import pickle
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
-from daq.identification.baseline import Baseline, LinearData, baselines_of
+from daq.identification.baseline import (
+    Baseline,
+    LinearData,
+    baselines_of,
+    joined,
+    of_inputs,
+    of_regressors,
+)
 from daq.identification.records import Split
 from daq.identification.settings import Problem, problem_of
 from daq.second_process import Job, SecondProcess
@@ -25,29 +32,32 @@ if TYPE_CHECKING:
 
 
 class Draft:
-    """An identification's second process; ends with its context."""
+    """What a second process does for one identification."""
 
-    def __init__(self) -> None:
-        self.second = SecondProcess()
-        self._linear: Job[list[Baseline] | str] | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.second.__exit__()
+    def __init__(self, second: SecondProcess) -> None:
+        self.second = second
+        self._data: LinearData | None = None
+        self._linear: list[Job[list[Baseline] | str]] = []
 
     def begin(self, problem: Problem, logs: Split) -> None:
-        """Have that compiled or loaded which is wanted after the search, and baselines fitted."""
+        """Have what is wanted after the search compiled or loaded, and baselines fitted."""
         request = pickle.dumps(problem.request)
         self.second.call(_compiled_ahead, request, logs[0][0].dataset)
-        self._linear = self.second.call(baselines_of, LinearData.of(problem.model, *logs))
+        self._data = LinearData.of(problem.model, *logs)
+        self._linear = [self.second.call(of_inputs, self._data)]
 
     def baselines(self, model: ProcessModel, logs: Split) -> list[Baseline] | str:
         """Those of the logs, or why there are none."""
-        if self._linear is None:
+        if not self._linear:
             return baselines_of(LinearData.of(model, *logs))
-        return self._linear.result()
+        self._go_on()
+        plain, extended = (job.result() for job in self._linear)
+        return joined(plain, extended)
+
+    def _go_on(self) -> None:
+        """Have the rest of the baselines fitted, which is only wanted for the report."""
+        if self._data is not None and len(self._linear) == 1:
+            self._linear.append(self.second.call(of_regressors, self._data))
 
     def score_tests(
         self, problem: Problem, estimator: GASSI, training: Sequence[Dataset]
@@ -61,7 +71,7 @@ class Draft:
         def here(uncertainty: Uncertainty) -> tuple[Finding, ...]:
             return score_tests_of(estimator, training).findings(uncertainty)
 
-        if self._linear is None or not self._linear.is_answered:
+        if not self._linear or not self._linear[0].is_answered:
             return here
         fit = pickle.dumps(problem.request), _without_models((estimator, list(training)))
         begun = self.second.call(_begun, *fit)
@@ -69,7 +79,9 @@ class Draft:
         def findings(uncertainty: Uncertainty) -> tuple[Finding, ...]:
             if not begun.result():
                 return here(uncertainty)
-            return self.second.call(_findings, *fit, uncertainty).result()
+            job = self.second.call(_findings, *fit, uncertainty)
+            self._go_on()
+            return job.result()
 
         return findings
 

@@ -6,7 +6,6 @@ import difflib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,9 +19,6 @@ from daq.logs.table import column_names, read_table
 from daq.logs.time_base import require_rows, time_base
 from sysid.problem.model import Input, Output, ProcessModel
 from sysid.problem.preparation import filtered, low_pass
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Signal = Input | Output
 SignalGroup = tuple[str, dict[str, Column], Sequence[Signal]]
@@ -140,7 +136,7 @@ def read_foreign(
     gaps = [name for name in measured if name is not None and name not in sources]
     parts = {file: _read(file, columns, gaps, mapping) for file, columns in places.items()}
     log = parts[path]
-    columns = {name: log.frame[name].to_numpy() for name in places[path]}
+    columns = {name: log.columns[name] for name in places[path]}
     held = {name for name, signal in sources.items() if name is not None and signal.hold == "zoh"}
     kept = np.ones(len(log.time), dtype=bool)
     for file, part in parts.items():
@@ -175,7 +171,7 @@ def read_foreign(
 class _Part:
     """A file's columns, its times [s] and sequence numbers, and whether its last line was cut."""
 
-    frame: pd.DataFrame
+    columns: Mapping[str, FloatArray]
     time: FloatArray
     tick: IntArray
     dt: float
@@ -187,9 +183,13 @@ def _read(
 ) -> _Part:
     time = mapping.columns.time.column
     names = sorted({*columns, *([] if time is None else [time])})
-    frame, first_line, torn = read_table(path, names, _CURE, [n for n in gaps if n in names])
-    require_rows(path, len(frame))
-    return _Part(frame, *_foreign_time(path, frame, first_line, mapping), torn)
+    table, first_line, torn = read_table(path, names, _CURE, [n for n in gaps if n in names])
+    require_rows(path, _n_rows(table))
+    return _Part(table, *_foreign_time(path, table, first_line, mapping), torn)
+
+
+def _n_rows(table: Mapping[str, FloatArray]) -> int:
+    return len(next(iter(table.values())))
 
 
 def _moved(part: _Part, name: str, log: _Part, held: bool) -> FloatArray:
@@ -198,8 +198,7 @@ def _moved(part: _Part, name: str, log: _Part, held: bool) -> FloatArray:
     A held input's is the latest before, others run straight between two samples and are NaN beside
     one that was not measured; those of a faster file pass a low-pass first.
     """
-    values: FloatArray = part.frame[name].to_numpy(dtype=np.float64)
-    time = part.time
+    values, time = part.columns[name], part.time
     if held:
         latest = np.searchsorted(time, log.time + 1e-3 * part.dt, side="right") - 1
         before: FloatArray = values[np.maximum(latest, 0)]
@@ -250,16 +249,16 @@ def _lacking(path: Path, name: str, present: Sequence[str]) -> str:
 
 
 def _foreign_time(
-    path: Path, frame: pd.DataFrame, first_line: int, mapping: ColumnMapping
+    path: Path, table: Mapping[str, FloatArray], first_line: int, mapping: ColumnMapping
 ) -> tuple[FloatArray, IntArray, float]:
     """Times [s] and sequence numbers of a foreign table's rows, and their sample time [s]."""
     time = mapping.columns.time
     if time.column is None:
         assert time.sample_rate is not None
-        tick: IntArray = np.arange(len(frame), dtype=np.int64)
+        tick: IntArray = np.arange(_n_rows(table), dtype=np.int64)
         return tick / time.sample_rate, tick, 1.0 / time.sample_rate
     seconds = unit_factor(mapping.file, TIME_UNIT, time.unit, "s")
-    values = frame[time.column].to_numpy() * seconds
+    values = table[time.column] * seconds
     cure = (
         "say 'grid: 0.001' (s) in 'columns: time:' to round uneven times to multiples of it, or "
         "resample the log to a constant rate"

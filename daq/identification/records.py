@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.config.identification import Column, Columns, TimeColumn
 from daq.config.yaml_file import YamlFile
@@ -165,13 +166,14 @@ def from_frame(
         numbers = frame.loc[:, list(wanted)].astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"a column is not of numbers: {error}", file=name) from None
-    for column in wanted:
-        values, is_output = numbers[column].to_numpy(), column in model.output_names
+    columns: dict[str, npt.NDArray[Any]] = {name: numbers[name].to_numpy() for name in wanted}
+    for column, values in columns.items():
+        is_output = column in model.output_names
         wrong = np.isinf(values) if is_output else ~np.isfinite(values)
         cure = "NaN stands for what was not measured" if is_output else "remove these rows"
         refuse_rows(path, wrong, "it is not finite", 0, column, cure)
-    tick, dt = time_base(path, numbers["t"].to_numpy(), first_line=0)
-    log = Recording(path, numbers.assign(tick=tick), dt)
+    columns["tick"], dt = time_base(path, columns["t"], first_line=0)
+    log = Recording(path, columns, dt)
     record = LoggedRecord(_from_log(log, model, name, selection), path, None)
     return _prepared(record, model, selection)
 
@@ -274,21 +276,23 @@ def _from_log(
     speeds: MeanSpeeds | None = None,
 ) -> Dataset:
     """The model's signals of a log; speeds: what its encoder's are the means of."""
-    columns = list(log.frame.columns)
+    columns = log.columns
     for name in (*model.input_names, *model.output_names):
         if name not in columns:
             problem = f"model {model.name} needs {name!r}, which is no column of this log"
             section = "Name the column in the 'columns' section of a file given with --config"
-            cure = f"{suggestion(name, columns)} {section}"
+            cure = f"{suggestion(name, list(columns))} {section}"
             raise ConfigError(problem, cure=cure, file=log.path)
-    inputs = log.frame[list(model.input_names)].to_numpy(dtype=np.float64)
-    outputs = log.frame[list(model.output_names)].to_numpy(dtype=np.float64)
-    tick, rows = log.frame["tick"].to_numpy(), selection.rows(log.path, log.frame["t"].to_numpy())
+    inputs, outputs = (
+        np.reshape([columns[name] for name in names], (len(names), -1)).T.astype(np.float64)
+        for names in (model.input_names, model.output_names)
+    )
+    tick, rows = columns["tick"], selection.rows(log.path, columns["t"])
     if speeds is not None:
         speed = np.array([name == SPEED for name in model.output_names])
         outputs = np.where(speed, speeds.values[:, None], outputs)
     dataset = _dataset(log.path, model, inputs[rows], outputs[rows], tick[rows], log.dt, title)
-    dataset = replace(dataset, begin=float(log.frame["t"].to_numpy()[rows][0]))
+    dataset = replace(dataset, begin=float(columns["t"][rows][0]))
     if speeds is not None:
         windows, jitter = np.zeros((*dataset.outputs.shape, 2)), np.zeros(dataset.outputs.shape)
         places = tick[rows] - tick[rows][0]

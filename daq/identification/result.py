@@ -352,13 +352,7 @@ class Identification(Shown):
         """
         import pandas as pd
 
-        rows = [
-            {"part": part, "log": log.name, "output": output, **errors.figures, "unit": errors.unit}
-            for part, logs in self.rows.logs.items()
-            for log in logs
-            for output, errors in log.outputs.items()
-        ]
-        return pd.DataFrame(rows).set_index(["part", "log", "output"])
+        return pd.DataFrame(self.rows.errors).set_index(["part", "log", "output"])
 
     def save(self, folder: str | Path) -> Path:
         """Write ``parameters.yaml`` into a folder; its path. Raises ConfigError."""

@@ -307,6 +307,16 @@ class Rows:
         """The row of a parameter. Raises KeyError for a name that is none's."""
         return {row.name: row for row in self.parameters}[name]
 
+    @property
+    def errors(self) -> list[dict[str, str | float]]:
+        """Figures of each part, log and output, by their names."""
+        return [
+            {"part": part, "log": log.name, "output": output, **errors.figures, "unit": errors.unit}
+            for part, logs in self.logs.items()
+            for log in logs
+            for output, errors in log.outputs.items()
+        ]
+
     @cached_property
     def free(self) -> tuple[ParameterRow, ...]:
         """Parameters that were searched."""

@@ -28,9 +28,8 @@ def write_mat(recording: Recording, path: Path) -> None:
     """
     from scipy.io import savemat
 
-    names = [str(name) for name in recording.frame]
-    columns = {_matlab_name(name): recording.frame[name].to_numpy() for name in names}
-    units = {_matlab_name(name): UNITS[name] for name in names if name in UNITS}
+    columns = {_matlab_name(name): values for name, values in recording.columns.items()}
+    units = {_matlab_name(name): UNITS[name] for name in recording.columns if name in UNITS}
     content = columns | {"units": units, "dt": recording.dt, "record": _record(recording)}
     file: Any = BytesIO()  # its stubs know no files but by their paths
     savemat(file, content, oned_as="column", long_field_names=True, do_compression=True)
@@ -73,13 +72,13 @@ def write_mcap(recording: Recording, path: Path) -> None:
     schema = writer.register_schema(
         name="samples", encoding="jsonschema", data=json.dumps(_schema(recording)).encode()
     )
-    units = {str(name): UNITS.get(str(name), "") for name in recording.frame}
+    units = {name: UNITS.get(name, "") for name in recording.columns}
     channel = writer.register_channel(
         topic=_TOPIC, message_encoding="json", schema_id=schema, metadata=units
     )
     began = _began(recording)
     rows = recording.frame.to_json(orient="records", lines=True, double_precision=15).splitlines()
-    times = recording.frame["t"].to_numpy()
+    times = recording.columns["t"]
     for sequence, (time, row) in enumerate(zip(times, rows, strict=True)):
         stamp = began + round(float(time) * _NANOSECONDS)
         writer.add_message(channel, stamp, row.encode(), stamp, sequence)
@@ -105,7 +104,7 @@ def _schema(recording: Recording) -> dict[str, object]:
         name: {"type": ["number", "null"], "description": f"[{UNITS[name]}]"}
         if name in UNITS
         else {"type": ["number", "null"]}
-        for name in recording.frame
+        for name in recording.columns
     }
     return {"type": "object", "properties": properties}
 

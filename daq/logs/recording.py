@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from daq.config import json_file
 from daq.config.rig import Encoder
@@ -29,24 +31,35 @@ if TYPE_CHECKING:
 class Recording(Shown):
     """A log in SI units, with what is known of its run.
 
-    frame: one row per sample with at least the columns of the original program and ``tick``,
+    columns: (n_samples,) each, at least those of the original program and ``tick``,
     ``applied_voltage_motor``, ``applied_voltage_brake``, ``flags``. dt: sample time [s]. torn: the
     last line was cut, or broken by a measurement that is no number, and left out. record: what
     run.json holds, None without one. warning: None for a run that completed, else one line that
     says how it ended.
 
-    >>> import pandas as pd
-    >>> frame = pd.DataFrame({"t": [0.0, 0.1]})
-    >>> Recording(Path("runs/20260101T120000Z-prbs/log.csv"), frame, dt=0.1).name
+    >>> columns = {"t": np.array([0.0, 0.1])}
+    >>> Recording(Path("runs/20260101T120000Z-prbs/log.csv"), columns, dt=0.1).name
     '20260101T120000Z-prbs'
     """
 
     path: Path
-    frame: pd.DataFrame
+    columns: Mapping[str, npt.NDArray[Any]]
     dt: float
     torn: bool = False
     record: dict[str, Any] | None = None
     warning: str | None = None
+
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """The columns as a table, one row per sample."""
+        import pandas as pd  # a fifth of a second, of most commands for nothing
+
+        return pd.DataFrame(dict(self.columns))
+
+    @property
+    def n_samples(self) -> int:
+        """Number of rows."""
+        return len(self.columns["t"])
 
     @property
     def name(self) -> str:
@@ -56,7 +69,7 @@ class Recording(Shown):
     @property
     def headline(self) -> str:
         """Its name, length and rate, and how the run ended if not as it should."""
-        n = len(self.frame)
+        n = self.n_samples
         size = f"{self.name}, {n} samples, {n * self.dt:.4g} s at {1.0 / self.dt:.4g} Hz"
         return size if self.warning is None else f"{size}; {self.warning}"
 
@@ -64,8 +77,8 @@ class Recording(Shown):
         """Smallest, mean and largest of each channel."""
         rows = [["channel", "unit", "smallest", "mean", "largest"]]
         for name, unit in UNITS.items():
-            if name in self.frame and name != "t":
-                column = self.frame[name]
+            if name in self.columns and name != "t":
+                column = self.columns[name]
                 figures = column.min(), column.mean(), column.max()
                 rows.append([name, unit, *(f"{figure:.4g}" for figure in figures)])
         return rows
@@ -77,8 +90,7 @@ class Recording(Shown):
 
     def samples(self) -> Samples:
         """Its rows as the run had them."""
-        columns = {attribute: self.frame[name].to_numpy() for name, attribute in ATTRIBUTES.items()}
-        return Samples(**columns)
+        return Samples(**{attribute: self.columns[name] for name, attribute in ATTRIBUTES.items()})
 
     def noise(self, channel: str) -> tuple[float, float]:
         """Standard deviations of a channel's noise and of its zero, as the calibration found them.
@@ -109,7 +121,7 @@ class Recording(Shown):
             encoder = Encoder.model_validate(sensors["encoder"])
         except (KeyError, TypeError, ValueError):
             return None
-        tick, theta, omega = (self.frame[name].to_numpy() for name in ("tick", "theta", SPEED))
+        tick, theta, omega = (self.columns[name] for name in ("tick", "theta", SPEED))
         by_edges = encoder.speed == "edges"
         return mean_speeds(tick, theta, omega, self.dt, encoder.count, by_edges)
 
@@ -135,21 +147,18 @@ def load(path: str | Path, extra: Sequence[str] = ()) -> Recording:
     present = column_names(csv)
     names = [name for name in COLUMNS if name in present or name in ORIGINAL_COLUMNS]
     names += [name for name in extra if name in present]
-    frame, first_line, torn = read_table(csv, names)
-    require_rows(csv, len(frame))
-    logged_ticks = frame["tick"].to_numpy() if "tick" in frame else None
-    frame["tick"], dt = time_base(csv, frame["t"].to_numpy(), logged_ticks, first_line=first_line)
+    table, first_line, torn = read_table(csv, names)
+    columns: dict[str, npt.NDArray[Any]] = {**table}
+    require_rows(csv, len(columns["t"]))
+    columns["tick"], dt = time_base(csv, columns["t"], columns.get("tick"), first_line=first_line)
     for channel in ("motor", "brake"):
         # The original program logged only what it asked for.
-        if f"applied_voltage_{channel}" not in frame:
-            frame[f"applied_voltage_{channel}"] = frame[f"cmd_voltage_{channel}"]
-    if "flags" not in frame:
-        frame["flags"] = 0
-    uneven = (frame["flags"] % 1.0 != 0.0).to_numpy()
-    refuse_rows(csv, uneven, "it must be a whole number", first_line, "flags")
-    frame = frame.astype({"tick": np.int64, "flags": np.int64})
+        columns.setdefault(f"applied_voltage_{channel}", columns[f"cmd_voltage_{channel}"])
+    flags = columns.setdefault("flags", np.zeros(len(columns["t"])))
+    refuse_rows(csv, flags % 1.0 != 0.0, "it must be a whole number", first_line, "flags")
+    columns["flags"] = flags.astype(np.int64)
     record = read_record(csv)
-    return Recording(csv, frame, dt, torn, record, end_of_run(csv, record, torn))
+    return Recording(csv, columns, dt, torn, record, end_of_run(csv, record, torn))
 
 
 def load_whole(path: str | Path) -> Recording:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _NOTHING = ("", "nan", "na", "n/a", "null", "none")
 _CURE = "mend or remove these lines (removed lines count as lost samples)"
 _NO_NUMBERS = ("nan", "inf", "-inf")  # what a broken sensor may end a log with
 _HEAD = 1 << 20  # bytes in which a header stands
-_PIECE = 1 << 22  # bytes parsed at a time: what pandas makes of them stays in the processor's cache
+_PIECE = 1 << 22  # bytes parsed at a time: what is made of them stays in the processor's cache
 _COMPARED = 20  # lines whose decimals tell how a file is written
 _AS_TEXT = "export the table as CSV in UTF-8 (a worksheet by 'Save as', 'CSV UTF-8')"
 _TEXT_CONTROLS = b"\t\n\r\f"
@@ -50,11 +50,11 @@ def column_names(path: Path) -> list[str]:
 
 def read_table(
     path: Path, columns: Sequence[str] = (), cure: str = _CURE, gaps: Collection[str] = ()
-) -> tuple[pd.DataFrame, int, bool]:
+) -> tuple[dict[str, FloatArray], int, bool]:
     """Read a CSV of numbers with a header line, or a MAT file.
 
-    The columns as numbers, the line of the first row, and whether the last line was cut, or broken
-    by a measurement that is no number, and is left out.
+    The columns as numbers, (n_rows,) each, the line of the first row, and whether the last line
+    was cut, or broken by a measurement that is no number, and is left out.
 
     columns: wanted ones, default all. cure: what to do about cells that hold no number. gaps:
     columns that may have cells without one, empty or as in ``_NOTHING``; NaN in the table.
@@ -64,8 +64,6 @@ def read_table(
     header in the last of them, as NumPy writes it. Raises ConfigError that names file, line and
     column for anything else that is not a table of finite numbers with the given columns.
     """
-    import pandas as pd
-
     if path.suffix.lower() == matlab.SUFFIX:
         return _matlab_table(path, columns, cure, gaps), 1, False
     layout = _layout_with(path, columns)
@@ -73,8 +71,8 @@ def read_table(
     first_line = layout.line + 1
     plain = _plain_numbers(path, layout)
     if plain is not None:
-        frame, torn = plain
-        return frame[names], first_line, torn
+        table, torn = plain
+        return {name: table[layout.names.index(name)] for name in names}, first_line, torn
     text, torn = _complete_lines(path, layout=layout)
     cells = _cells(path, text, layout)
     without_gaps = [name for name in names if name not in gaps]
@@ -85,15 +83,13 @@ def read_table(
         name: _numbers(path, cells[name], first_line, decimal_comma, cure, name in gaps)
         for name in names
     }
-    return pd.DataFrame(numbers), first_line, torn
+    return numbers, first_line, torn
 
 
 def _matlab_table(
     path: Path, columns: Sequence[str], cure: str, gaps: Collection[str]
-) -> pd.DataFrame:
+) -> dict[str, FloatArray]:
     """Columns of a MAT file; ConfigError, whose line is the row from 1, as for a CSV."""
-    import pandas as pd
-
     arrays = matlab.columns_of(path)
     names = list(columns) or list(arrays)
     for name in names:
@@ -108,16 +104,31 @@ def _matlab_table(
     for name in names:
         wrong = np.isinf(arrays[name]) if name in gaps else ~np.isfinite(arrays[name])
         refuse_rows(path, wrong, "it is not a finite number", 1, name, cure)
-    return pd.DataFrame({name: arrays[name] for name in names})
+    return {name: arrays[name] for name in names}
 
 
 def _cells(path: Path, text: str, layout: Layout) -> pd.DataFrame:
     """The text of every cell below the header; ConfigError for rows that are too long."""
     import pandas as pd
 
+    # A column without a name, as a separator at each line's end makes it, gets its number.
+    names: list[str | int] = [name or place for place, name in enumerate(layout.names)]
     try:
-        source, separator = io.StringIO(text), layout.separator
-        return _parsed(source, layout, dtype=str, sep=separator, skiprows=layout.line)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # of a row that is too long
+            return pd.read_csv(
+                io.StringIO(text),
+                names=names,
+                dtype=str,
+                sep=layout.separator,
+                skiprows=layout.line,
+                skipinitialspace=True,
+                header=None,
+                index_col=False,
+                keep_default_na=False,
+                skip_blank_lines=False,
+                on_bad_lines="error",
+            )
     except pd.errors.ParserWarning:
         lines = text.splitlines()
         n_columns = len(layout.names)
@@ -135,33 +146,11 @@ def _cells(path: Path, text: str, layout: Layout) -> pd.DataFrame:
         raise ConfigError(f"not a table: {reason}", file=path) from None
 
 
-def _parsed(source: IO[Any], layout: Layout, dtype: type, **options: Any) -> pd.DataFrame:
-    """Rows below a header; a row that is too long raises ParserWarning, other faults ValueError."""
-    import pandas as pd
+def _plain_numbers(path: Path, layout: Layout) -> tuple[FloatArray, bool] | None:
+    """A table of nothing but finite numbers, read quickly, and whether it is torn; else None.
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", pd.errors.ParserWarning)
-        # A column without a name, as a separator at each line's end makes it, gets its number.
-        names: list[str | int] = [name or place for place, name in enumerate(layout.names)]
-        frame: pd.DataFrame = pd.read_csv(
-            source,
-            names=names,
-            dtype=dtype,
-            skipinitialspace=True,
-            header=None,
-            index_col=False,
-            keep_default_na=False,
-            skip_blank_lines=False,
-            on_bad_lines="error",
-            **options,
-        )
-    return frame
-
-
-def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | None:
-    """A table of nothing but finite numbers, read quickly, and whether it is torn; else None."""
-    import pandas as pd
-
+    (n_columns, n_rows).
+    """
     if layout.separator != ",":
         return None
     parts, torn = [], False
@@ -177,13 +166,21 @@ def _plain_numbers(path: Path, layout: Layout) -> tuple[pd.DataFrame, bool] | No
                 if len(piece) < _PIECE:
                     rows = rows.rstrip(b"\r\n")  # the file's end: empty lines there are no rows
                 if rows:
-                    part = _parsed(io.BytesIO(rows), layout, dtype=np.float64, low_memory=False)
-                    if b"\0" in rows or not np.isfinite(part.to_numpy()).all():
-                        return None
-                    parts.append(part)
-    except (OSError, ValueError, pd.errors.ParserWarning):
+                    parts.append(_finite_rows(rows, len(layout.names)).T)
+    except (OSError, ValueError):
         return None
-    return (pd.concat(parts, ignore_index=True), torn) if parts else None
+    return (np.concatenate(parts, axis=1), torn) if parts else None
+
+
+def _finite_rows(text: bytes, n_columns: int) -> FloatArray:
+    """Lines of so many numbers, a row each; ValueError for any others."""
+    lines = text.count(b"\n") + (not text.endswith(b"\n"))
+    if b"\0" in text or text.isspace():
+        raise ValueError
+    rows = np.loadtxt(io.BytesIO(text), delimiter=",", comments=None, ndmin=2)
+    if rows.shape != (lines, n_columns) or not np.isfinite(rows).all():  # it skips empty lines
+        raise ValueError
+    return rows
 
 
 def layout_of(text: str) -> Layout:

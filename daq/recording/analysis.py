@@ -125,7 +125,7 @@ def conclude(experiment: Experiment, folder: Path) -> Findings | None:
         return None
     extra = tuple(experiment.columns) if isinstance(experiment, ClosedLoop) else ()
     log = load(folder / LOG_NAME, extra)
-    columns = {name: log.frame[name].to_numpy() for name in extra if name in log.frame}
+    columns = {name: log.columns[name] for name in extra if name in log.columns}
     try:
         findings = experiment.findings(log.samples(), columns)
         if findings is not None and not isinstance(findings, Findings):

@@ -474,8 +474,8 @@ def _capture_signals(log: LoggedRecord) -> Figure:
 
 def _columns(log: LoggedRecord) -> dict[str, FloatArray]:
     """Columns of a capture's log by name."""
-    frame = load(log.path).frame
-    return {name: frame[name].to_numpy(dtype=np.float64) for name in UNITS}
+    columns = load(log.path).columns
+    return {name: columns[name].astype(np.float64) for name in UNITS}
 
 
 def draw_replay(replays: Sequence[Replay], path: Path) -> None:

@@ -1,7 +1,10 @@
 """The report of an identification: a page, figures, a LaTeX table and a JSON document."""
 
+import csv
 import datetime
+import io
 import json
+import math
 import shlex
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -44,8 +47,8 @@ def publish(
     draft: what was begun of it, if anything. Raises RunError where the disk refuses.
     """
     if draft is None:
-        with Draft() as begun:
-            return publish(result, folder, watch, begun)
+        with SecondProcess() as second:
+            return publish(result, folder, watch, Draft(second))
     watch(Progress("Report", 0, _STEPS, "linear baseline"))
     logs = [fitted.log for fitted in result.training], [fitted.log for fitted in result.validation]
     linear = draft.baselines(result.model, logs)
@@ -64,7 +67,7 @@ def publish(
         "data": (DATA, json.dumps(document, indent=1) + "\n"),
         "latex": (_TABLE, latex(subject.rows)),
         "latex_errors": (_ERRORS_TABLE, latex_errors(subject.rows)),
-        "errors": (_ERRORS, result.metrics.to_csv(lineterminator="\n")),
+        "errors": (_ERRORS, _table(result.rows.errors)),
     }
     for name, content in pages.values():
         write_whole(folder / name, content)
@@ -136,6 +139,17 @@ def fingerprints(logs: Split) -> list[dict[str, Any]]:
         for use, part in zip(("training", "validation"), logs, strict=True)
         for log in part
     ]
+
+
+def _table(rows: Sequence[Mapping[str, str | float]]) -> str:
+    """Rows as a CSV; nothing for what is no number."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        finite = {k: v for k, v in row.items() if isinstance(v, str) or math.isfinite(v)}
+        writer.writerow(finite)
+    return text.getvalue()
 
 
 def _document(

@@ -190,8 +190,8 @@ def test_a_matlab_file_is_a_log(folder):
     np.testing.assert_array_equal(record.outputs[:, 0], rows["y"])
     matrix = {"table": rows.to_numpy()}
     savemat(folder / "matrix.mat", matrix)
-    frame, _, torn = read_table(folder / "matrix.mat", ["table(:,2)"])
-    assert frame["table(:,2)"].tolist() == rows["u"].tolist() and not torn
+    read, _, torn = read_table(folder / "matrix.mat", ["table(:,2)"])
+    assert read["table(:,2)"].tolist() == rows["u"].tolist() and not torn
 
 
 def matlab_mistakes(folder):
@@ -229,8 +229,8 @@ def test_a_matlab_file_that_does_not_read_is_refused_with_the_way_to_convert_it(
 def test_a_last_line_without_newline_is_data_where_it_is_whole(tmp_path, text, n, torn):
     path = tmp_path / "foreign.csv"
     path.write_text(text)
-    frame, _, is_torn = read_table(path, ["t", "y"], gaps=["y"])
-    assert (len(frame), is_torn) == (n, torn)
+    read, _, is_torn = read_table(path, ["t", "y"], gaps=["y"])
+    assert (len(read["t"]), is_torn) == (n, torn)
     killed = tmp_path / "log.csv"
     killed.write_text(text)
     assert read_table(killed, ["t", "y"], gaps=["y"])[2]

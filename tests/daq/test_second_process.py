@@ -64,7 +64,7 @@ model = replace(lag(), derivative=lambda x, u, p: ((p[0] * u[0] - x[0]) / p[1] +
 
 
 class Waiting(Draft):
-    """One whose other process has nothing left to do when the search ends."""
+    """One whose process has nothing left to do when the search ends."""
 
     def begin(self, problem, logs):
         super().begin(problem, logs)
@@ -91,7 +91,8 @@ def test_what_the_model_may_lack_is_found_as_by_one(monkeypatch, problem, ends):
     monkeypatch.setattr(
         subprocess, "Popen", lambda *a, **k: processes.append(started(*a, **k)) or processes[-1]
     )
-    with Waiting() as draft:
+    with second_process.SecondProcess() as second:
+        draft = Waiting(second)
         if ends:
             begun = draft.score_tests
             monkeypatch.setattr(
