@@ -47,6 +47,9 @@ _FEWEST = 30.0
 # Deviance above which one minimum is no rival to another: one in a hundred for the four
 # parameters in which such minima typically differ.
 _TOLD_APART = 13.3
+# The same for two bottoms of one valley, where chance has but one direction: which of two is the
+# deeper varies by twice the root of how far apart they are, more than within either.
+_ALIKE = 6.63
 _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
 _MOST_PROMISING = 3  # minima of a part of the data that are fitted to all
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
@@ -79,8 +82,7 @@ class Optimum:
 class Likeliest:
     """The likeliest minimum, and others that the data do not tell from it, (n_free,) each.
 
-    rivals: minima apart from it. ridge: further points, of the valley in which it lies, that are
-    as good at the 95 % level.
+    rivals: minima apart from it. ridge: further bottoms of the valley in which it lies.
     """
 
     optimum: Optimum
@@ -124,7 +126,7 @@ def fit_likelihood(
     connected = optima.connected(best, rivals)
     apart = list(itertools.compress(rivals, np.logical_not(connected)))
     valley = itertools.compress(rivals, connected)
-    ridge = [rival for rival in valley if optima.deviance(rival, best) < Z95**2]
+    ridge = [rival for rival in valley if optima.deviance(rival, best) < _ALIKE]
     return Likeliest(_slid(_resting(best)), _chromosomes(apart), _chromosomes(ridge))
 
 

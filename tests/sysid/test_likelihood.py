@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 
 from sysid import GASSI, BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.fitting.descent import Restriction
@@ -278,6 +278,43 @@ def test_a_curved_valley_is_one_answer_and_its_hull_the_interval():
         assert estimate.why in ("", "vague")
         assert (estimate.low or 0.5) <= min(end[j] for end in ends) + 0.1
         assert (estimate.high or 10.0) >= max(end[j] for end in ends) - 0.1
+
+
+def bent_objective(seed):
+    """y = (q(a) u0 + c a u1) and noise: q is alike on both sides of a low wall, c hardly felt."""
+    model = ProcessModel(
+        name="formula",
+        states=(State("x", "1"),),
+        inputs=(Input("u0", "1"), Input("u1", "1")),
+        outputs=(Output("x", "1"),),
+        parameters=(Parameter("a", "1", 2.0, -5.0, 10.0, minimum=-np.inf),),
+        derivative=twice_derivative,
+    )
+
+    def outputs(p, u):
+        return (0.018 * ((p["a"] - 2.0) ** 2 - 1.0) * u[:, 0] + 0.0058 * p["a"] * u[:, 1])[:, None]
+
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((300, 2))
+    y = outputs({"a": 3.0}, u) + 0.1 * rng.standard_normal((300, 1))
+    return Objective(Formula(model, outputs), SearchSpace.of(model), [Dataset(u, y, 0.01)])
+
+
+@pytest.mark.parametrize("seed", [21, 28])  # of whose bottoms one is 6.5 and 3.9 behind
+def test_every_bottom_of_a_valley_has_its_own_interval_within_the_whole(seed):
+    target = bent_objective(seed)
+    result = fit_likelihood(target, [np.array([3.0]), np.array([1.0])])
+    assert result.rivals == () and len(result.ridge) == 1
+    best, (behind,) = result.optimum.chromosome, result.ridge
+    (a,) = uncertainty(result.optimum.objective, best, (), result.ridge).parameters
+
+    def beyond(place, bottom):  # twice the log-likelihood that is lost from there, above 3.84
+        rms = target.rms(np.array([[place], bottom]))[:, 0]
+        return 600.0 * np.log(rms[0] / rms[1]) - 3.84
+
+    low, high = sorted([best, behind], key=lambda bottom: bottom[0])
+    assert a.low == pytest.approx(brentq(beyond, low[0] - 2.0, low[0], (low,)), abs=0.1)
+    assert a.high == pytest.approx(brentq(beyond, high[0], high[0] + 2.0, (high,)), abs=0.1)
 
 
 def test_minima_with_a_wall_between_them_are_rivals_each_with_an_interval():
