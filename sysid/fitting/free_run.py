@@ -1,5 +1,8 @@
 """Free runs of a record's inputs, and where they start when the record does not say."""
 
+from dataclasses import dataclass
+from typing import Self
+
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
@@ -13,6 +16,7 @@ from sysid.problem.space import SearchSpace
 # Factor to the next accuracy where the errors of single steps add up, and the last accuracy.
 _FINER, _FINEST = 0.1, 1e-9
 _PART = 0.5  # of a deviation by which errors of the steps may move any quantity
+_SHARE = 0.3  # of what is left of an output that they may be: more would show in it
 _FAR_MORE = 16  # times the steps that a search took, above which they would cost too much
 
 
@@ -20,7 +24,8 @@ def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> 
     """Outputs of a record's inputs, (n_samples, n_outputs), from where the record starts.
 
     Initial states with a range are estimated from the record's outputs. The simulator's accuracy
-    holds for the whole run, also where the errors of its steps add up.
+    holds for the whole run, also where the errors of its steps add up; and they are small beside
+    what the run leaves of outputs that were measured.
 
     >>> from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
     >>> model = ProcessModel(
@@ -35,17 +40,49 @@ def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> 
     >>> free_run(BatchSimulator(model), model.nominal, record)[:, 0].round(3)
     array([0.   , 0.632, 0.865, 0.95 ])
     """
-    accuracy = simulator.accuracy
-    while True:
-        start = estimate_start(simulator, vector, record)
-        outputs: FloatArray = simulator.trajectories(vector, record, starts=start[None])[0]
-        twice = 2 * int(simulator.steps_of_each(vector, record).max())
-        finer = simulator.trajectories(vector, record, twice, start[None])[0]
-        error = np.sqrt(np.mean((finer - outputs) ** 2, axis=0))
-        size = np.maximum(np.max(np.abs(finer), axis=0), 1e-300)
-        if not np.max(error / size) > accuracy or simulator.accuracy < _FINEST:
-            return outputs
-        simulator = simulator.finer(_FINER * simulator.accuracy)
+    return FreeRun.of(simulator, vector, record).outputs
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """A free run, (n_samples, n_outputs), and what it is made of.
+
+    simulator: accurate enough for it. start: (n_states,), where it begins.
+    """
+
+    simulator: BatchSimulator
+    start: FloatArray
+    outputs: FloatArray
+
+    @classmethod
+    def of(cls, simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> Self:
+        """As ``free_run``."""
+        accuracy = simulator.accuracy
+        while True:
+            start = estimate_start(simulator, vector, record)
+            steps = int(simulator.steps_of_each(vector, record, start[None]).max())
+            few, many = (
+                simulator.trajectories(vector, record, n, start[None])[0]
+                for n in (steps, 2 * steps)
+            )
+            run = cls(simulator, start, few)
+            if not run._errs(few - many, record, accuracy):
+                return run
+            taken = steps
+            while steps <= taken:
+                if simulator.accuracy < _FINEST:
+                    return run
+                simulator = simulator.finer(_FINER * simulator.accuracy)
+                steps = int(simulator.steps_of_each(vector, record, start[None]).max())
+
+    def _errs(self, error: FloatArray, record: Dataset, accuracy: float) -> bool:
+        """Whether errors of the steps, (n_samples, n_outputs), are more than a run may have."""
+        admitted = accuracy * np.maximum(np.max(np.abs(self.outputs), axis=0), 1e-300)
+        seen = np.isfinite(record.outputs)
+        left = np.where(seen, record.outputs - self.outputs, 0.0)
+        squares, counts = np.sum(left**2, axis=0), seen.sum(axis=0)
+        shown = np.where(counts > 0, _SHARE * np.sqrt(squares / np.maximum(counts, 1)), np.inf)
+        return bool(np.any(np.sqrt(np.mean(error**2, axis=0)) > np.minimum(admitted, shown)))
 
 
 def accurate(objective: Objective, chromosome: FloatArray) -> Objective:
@@ -81,13 +118,15 @@ def fine_enough(objective: Objective, chromosome: FloatArray, rms: FloatArray) -
 
 
 def _swayed(objective: Objective, chromosome: FloatArray, steps: IntArray, rms: FloatArray) -> bool:
-    """Whether errors of so many steps (1, n_records) move a quantity noticeably."""
+    """Whether errors of so many steps (1, n_records) show, or move a quantity noticeably."""
 
     def in_noise(chromosomes: FloatArray) -> FloatArray:
         taken = np.repeat(steps, len(chromosomes), axis=0)
         return objective.residuals(chromosomes, taken).values / rms[:, None]
 
     change = _change_by_steps(objective, chromosome, steps) / rms
+    if np.any(np.mean(change**2, axis=0) > _SHARE**2):
+        return True
     if not np.linalg.norm(change) > _PART:
         return False
     return moved_by(change, in_noise, objective.space, chromosome) > _PART

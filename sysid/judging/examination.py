@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from sysid.arrays import FloatArray
-from sysid.fitting.free_run import estimate_start
+from sysid.fitting.free_run import FreeRun
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi import GASSI, PRESETS
@@ -75,14 +75,19 @@ def examined(
     uncertainty: None where the parameters have no intervals; nothing is known then of the errors
     that a right model would make.
     """
-    run, simulator, vector = estimator.predict(record), estimator.simulator(), estimator.vector_
-    start = estimate_start(simulator, vector, record)
-    starts = estimated_starts(simulator, vector, record, start)
+    run = FreeRun.of(estimator.simulator(), estimator.vector_, record)
+    starts = estimated_starts(run.simulator, estimator.vector_, record, run.start)
     if uncertainty is None:
-        return run, examine(record, run, starts=starts)
-    space, chromosome = estimator.space_, estimator.chromosome_
-    expected = expected_errors(simulator, space, chromosome, record, start, uncertainty.covariance)
-    return run, examine(record, run, expected, starts)
+        return run.outputs, examine(record, run.outputs, starts=starts)
+    expected = expected_errors(
+        run.simulator,
+        estimator.space_,
+        estimator.chromosome_,
+        record,
+        run.start,
+        uncertainty.covariance,
+    )
+    return run.outputs, examine(record, run.outputs, expected, starts)
 
 
 @one_thread()

@@ -279,6 +279,15 @@ def test_errors_of_single_steps_do_not_add_up_beyond_the_accuracy(swinging):
     assert np.sqrt(np.mean((outputs - exact.outputs) ** 2)) < 1e-3 * 1.2
 
 
+def test_errors_of_the_steps_do_not_show_in_what_a_run_leaves(swinging):
+    """An encoder resolves an angle far better than a search simulates to."""
+    model, exact, _ = swinging
+    noise = 5e-5 * np.random.default_rng(1).standard_normal(exact.outputs.shape)
+    record = replace(exact, outputs=exact.outputs + noise)
+    left = free_run(BatchSimulator(model), SWING, record) - record.outputs
+    assert np.sqrt(np.mean(left**2)) < 1.1 * np.sqrt(np.mean(noise**2))
+
+
 @pytest.mark.soak
 def test_what_acts_only_together_is_told_where_slopes_are_jagged(swinging):
     model, _, noisy = swinging
