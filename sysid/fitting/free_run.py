@@ -40,11 +40,11 @@ def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> 
     >>> free_run(BatchSimulator(model), model.nominal, record)[:, 0].round(3)
     array([0.   , 0.632, 0.865, 0.95 ])
     """
-    return FreeRun.of(simulator, vector, record).outputs
+    return AccurateRun.of(simulator, vector, record).outputs
 
 
 @dataclass(frozen=True)
-class FreeRun:
+class AccurateRun:
     """A free run, (n_samples, n_outputs), and what it is made of.
 
     simulator: accurate enough for it. start: (n_states,), where it begins.

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from sysid.arrays import FloatArray
-from sysid.fitting.free_run import FreeRun
+from sysid.fitting.free_run import AccurateRun
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi import GASSI, PRESETS
@@ -75,7 +75,7 @@ def examined(
     uncertainty: None where the parameters have no intervals; nothing is known then of the errors
     that a right model would make.
     """
-    run = FreeRun.of(estimator.simulator(), estimator.vector_, record)
+    run = AccurateRun.of(estimator.simulator(), estimator.vector_, record)
     starts = estimated_starts(run.simulator, estimator.vector_, record, run.start)
     if uncertainty is None:
         return run.outputs, examine(record, run.outputs, starts=starts)
