@@ -27,6 +27,7 @@ _MEAN_SQUARE, _LARGEST = 1.25, 5.5
 # Most that may be lost of a signal, in parts of what is taken away, the deviations of chance that
 # may hide it, and the most that they may hide of what one step takes away.
 _MOST_LOST, _SURELY, _HIDDEN = 0.1, 2.0, 0.15
+_TWICE = 4.0  # of the noise's deviation, in variances
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,23 @@ def coloured(noise: FloatArray, colour: FloatArray) -> FloatArray:
     return onward
 
 
+def just_missed(noise: FloatArray, colour: FloatArray) -> FloatArray:
+    """What averages take of white noise, (n_samples, n_inputs), that others would let through.
+
+    colour: theirs, (n_inputs,). The others leave twice the noise, or all of it if that is less.
+
+    >>> white = np.random.default_rng(0).standard_normal((4096, 1))
+    >>> just_missed(white, np.array([0.92])).std().round(2)
+    np.float64(0.24)
+    """
+    missed = np.zeros_like(noise)
+    for j in np.flatnonzero(colour):
+        left = min(_TWICE * (1.0 - colour[j]) / (1.0 + colour[j]), 1.0)
+        narrow, wide = _weights((1.0 - left) / (1.0 + left)), _weights(float(colour[j]))
+        missed[:, j] = _convolved(noise[:, j], narrow) - _convolved(noise[:, j], wide)
+    return missed
+
+
 def _averaged(signal: FloatArray, noise: float) -> tuple[FloatArray, float, float]:
     """A signal averaged as widely as its noise allows, with ``Denoised.colour`` and ``lost``."""
     weights, average, colour, share = np.ones(1), signal, 0.0, 0.0
@@ -105,7 +123,7 @@ def _weights(colour: float) -> FloatArray:
 
     Half of it comes from those before, half from those behind: (1 - a / z)^(-1/2) each.
     """
-    count = int(np.ceil(np.log(_NEGLIGIBLE) / np.log(colour)))
+    count = int(np.ceil(np.log(_NEGLIGIBLE) / np.log(colour))) if colour else 0
     steps = np.arange(1, count + 1)
     half = np.cumprod(np.append(1.0, colour * (1.0 - 0.5 / steps)))
     weights = np.correlate(half, half, mode="full")

@@ -510,9 +510,9 @@ class _Analysis:
         drafts, fits = list(drafts), list(self.ridge)
         for _ in range(_ROUNDS):
             searches = [
-                (k, draft.tracer, sign, begin)
+                (k, tracer.beside(self.local, begin) if begin else tracer, sign, begin)
                 for k, draft in enumerate(drafts)
-                if draft.tracer
+                if (tracer := draft.tracer)
                 for sign, begin in draft.searches(fits).items()
             ]
             if not searches:

@@ -16,6 +16,7 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.uncertainty.colour import colour, score_covariance
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
+    averages_errors,
     input_noises,
     noise_pushes,
     parabola_errors,
@@ -102,7 +103,8 @@ def covariance(
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = _larger(score, _score_covariance_by_inputs(sensitivity, weighted))
     starts = (change for _, change in start_errors(sensitivity))
-    for errors in (zero_errors(sensitivity), starts, parabola_errors(sensitivity)):
+    constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
+    for errors in (*constant, averages_errors(sensitivity)):
         score += _score_covariance_by(weighted, errors)
     pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, slopes.shape[2])
     score += pushes.T @ pushes

@@ -1,8 +1,9 @@
 """Profile likelihood: how much worse the best fit becomes as one parameter is moved."""
 
+import copy
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -126,16 +127,16 @@ def traced(
 
 def _fitted(tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
     """The best fits to places."""
-    if not tasks:
-        return []
-    objective = tasks[0][0].objective
-    descents = _begun(objective, tasks)
-    ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
-    errors, coded = objective.evaluate(ends)[0].tolist(), objective.space.encode(ends)
-    return [
-        Fit(wanted.place, tracer.statistic(error), at, error)
-        for (tracer, wanted), error, at in zip(tasks, errors, coded, strict=True)
-    ]
+    fits: dict[int, Fit] = {}
+    for objective in {id(tracer.objective): tracer.objective for tracer, _ in tasks}.values():
+        places = [k for k, (tracer, _) in enumerate(tasks) if tracer.objective is objective]
+        descents = _begun(objective, [tasks[k] for k in places])
+        ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
+        errors, coded = objective.evaluate(ends)[0].tolist(), objective.space.encode(ends)
+        for k, error, at in zip(places, errors, coded, strict=True):
+            tracer, wanted = tasks[k]
+            fits[k] = Fit(wanted.place, tracer.statistic(error), at, error)
+    return [fits[k] for k in range(len(tasks))]
 
 
 def _begun(objective: Objective, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Descent]:
@@ -163,9 +164,8 @@ class Tracer:
         gradient: FloatArray,
         quantity: Profiled,
     ) -> None:
-        objective, self.quantity = local.nearby, quantity
-        self.objective = objective
-        self.start = objective.space.encode(local.chromosome)
+        self.quantity, self.start = quantity, local.objective.space.encode(local.chromosome)
+        objective = self.objective = local.around(self.start)
         self.centre = quantity.at(self.start)
         self.error = local.error
         deviation = covariance.deviation(gradient)
@@ -254,6 +254,12 @@ class Tracer:
             return outside.place
         share = 0.5 if halve else _share(inside, outside)
         return inside.place + share * (outside.place - inside.place)
+
+    def beside(self, local: Sensitivity, fit: Fit) -> Self:
+        """The same for places around a fit, perhaps far from the estimate."""
+        tracer = copy.copy(self)
+        tracer.objective = local.around(fit.at)
+        return tracer
 
     def statistic(self, error: float) -> float:
         """Twice the loss of log-likelihood by an error."""

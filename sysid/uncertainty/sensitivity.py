@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.fitting.averages import just_missed
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
@@ -24,6 +25,7 @@ _DRAWS, _FEWEST_DRAWS = 128, 32
 # Shares by which the variance of an output's noise is raised until its innovations show it.
 _RAISED = 0.02 * 4.0 ** np.arange(12)
 _CHANCE_OF_SHOWN = 3.0  # deviations times the root of the samples of a variance by differences
+_SMALL = 0.1  # part of that noise to which a filter answers in proportion, kinks aside
 _TINY = 1e-300
 
 
@@ -65,12 +67,18 @@ class Sensitivity:
         """Slopes of the outputs that have a weight, (n_rows, n_free)."""
         return self.slopes[:, self.objective.weights > 0.0].reshape(-1, len(self.chromosome))
 
+    def around(self, at: FloatArray) -> Objective:
+        """The criterion for places around search coordinates, (n_free,)."""
+        if not isinstance(self.criterion, Innovations):
+            return self.criterion
+        key = at.tobytes()
+        if key not in self._nearby:
+            self._nearby[key] = self.criterion.around(self.objective.space.decode(at))
+        return self._nearby[key]
+
     @cached_property
-    def nearby(self) -> Objective:
-        """The criterion for places around the chromosome."""
-        if isinstance(self.criterion, Innovations):
-            return self.criterion.around(self.chromosome)
-        return self.criterion
+    def _nearby(self) -> dict[bytes, Objective]:
+        return {}
 
     @cached_property
     def error(self) -> float:
@@ -220,6 +228,26 @@ def parabola_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
         moved = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
         change += moved * sensitivity.share
     yield change
+
+
+def averages_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+    """Changes (n_residuals, n_outputs) by what averages of noisy inputs may take of the signal.
+
+    How wide they are is a choice, and what they take repeats itself with the inputs. It is taken
+    for as large as the noise that narrower ones would let through, drawn at random, always the
+    same, and acts in proportion.
+    """
+    objective = sensitivity.objective
+    if not (isinstance(objective, Innovations) and objective.quiet):
+        return
+    rng = np.random.default_rng(0)
+    for k, record in enumerate(objective.records):
+        colour = objective.colour[k]
+        noise = record.input_noise * np.sqrt((1.0 + colour) / (1.0 - colour))
+        for _ in range(_FEWEST_DRAWS):
+            missed = just_missed(noise * rng.standard_normal(record.inputs.shape), colour)
+            moved = replace(record, inputs=record.inputs + _SMALL * missed)
+            yield _change_by_record(sensitivity, k, moved) / (_SMALL * np.sqrt(_FEWEST_DRAWS))
 
 
 def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]:

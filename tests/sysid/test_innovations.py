@@ -23,9 +23,10 @@ from sysid import (
     SearchSpace,
     State,
 )
-from sysid.fitting.averages import denoised
+from sysid.fitting.averages import denoised, just_missed
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.likelihood import Optimum, better_by_filter, noisy_fit, towards
 from sysid.uncertainty import uncertainty
@@ -422,6 +423,36 @@ def test_averages_are_as_wide_as_chance_can_be_told_and_trust_no_end_point():
     quiet = denoised(Dataset(2.0 + noise, noise, DT, input_noise=np.ones(1))).record
     assert 0.05 < quiet.input_noise[0] < 0.08
     assert np.max(np.abs(quiet.inputs - 2.0)) < 5.0 * quiet.input_noise[0]
+
+
+def test_what_averages_just_miss_is_what_twice_the_noise_has_more():
+    """Gains of first-order averages are closed: (1 - a) / |1 - a exp(-iw)|."""
+    colour = 0.9
+    narrow = np.sqrt((1.0 - colour) / (1.0 + colour)) * 2.0  # noise that is left
+    narrow = (1.0 - narrow**2) / (1.0 + narrow**2)
+    w = np.linspace(0.0, np.pi, 20_001)
+    gains = [((1.0 - a) / np.abs(1.0 - a * np.exp(-1j * w))) ** 2 for a in (colour, narrow)]
+    expected = np.sqrt(np.mean((gains[1] ** 0.5 - gains[0] ** 0.5) ** 2))
+    white = np.random.default_rng(0).standard_normal((100_000, 2))
+    missed = just_missed(white, np.array([0.0, colour]))
+    assert np.std(missed[:, 1]) == pytest.approx(expected, rel=0.02)
+    assert not missed[:, 0].any()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_intervals_hold_what_averages_lose_of_an_input(seed):
+    """A fast part of the input, three times below its noise, that acts and is averaged away."""
+    rng, time = np.random.default_rng(seed), np.arange(4000) * DT
+    u = (3.0 * np.sin(0.5 * time) + 0.1 * np.sin(12.0 * time))[:, None]
+    y = linear_response(np.array([[-1.0 / TAU]]), np.array([[GAIN / TAU]]), u, DT, "zoh")
+    y = y + 0.005 * rng.standard_normal(y.shape)
+    noisy = u[:, 0] + OF_INPUT * rng.standard_normal(4000)
+    record = Dataset(noisy, y, DT, input_noise=np.array([OF_INPUT]))
+    objective = Objective(BatchSimulator(lag()), SearchSpace.of(lag()), [record])
+    fitted = Innovations.of(objective, np.array([0.005]), corrects=True, quiet=True)
+    chromosome = refine(fitted, np.array([GAIN, TAU])).chromosome
+    (tau,) = (e for e in uncertainty(fitted, chromosome).parameters if e.name == "tau")
+    assert not tau.excludes({"tau": TAU})
 
 
 def test_a_filter_on_the_first_part_of_a_record_is_that_of_the_record():

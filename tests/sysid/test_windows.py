@@ -24,6 +24,7 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.means import each_mean_once, scatter
 from sysid.fitting.objective import Objective
 from sysid.problem.space import SearchSpace
+from sysid.uncertainty.sensitivity import sensitivity
 
 DT, TAU = 1e-3, 0.05
 N = 300
@@ -253,6 +254,14 @@ def test_a_filter_takes_no_parabolas_where_noise_does_not_cover_what_they_miss(n
         by.residuals(near, steps).values for by in (fitted.around(p), fitted, parabolas)
     )
     assert np.abs(known - there).max() <= 0.02 * np.abs(off - there).max()
+    # Far from an estimate around the place itself.
+    local = sensitivity(fitted, np.array([1.0, 2.0 * tau]))
+    beside, from_afar = (
+        local.around(objective.space.encode(at)).residuals(near, steps).values
+        for at in (p, local.chromosome)
+    )
+    assert np.array_equal(beside, known)
+    assert (np.abs(from_afar - there).max() > 0.02 * np.abs(off - there).max()) == exact
     # A place where nothing rings does not speak for the other.
     slow = np.array([1.0, 20.0 * DT])
     assert not parabolas.rings_at(slow[None])
