@@ -13,7 +13,7 @@ from typing import Any
 from daq.errors import ConfigError, Terminated
 from daq.files import write_whole
 from daq.identification import records
-from daq.identification.fit import assemble, check_writable, faults_of, load_logs
+from daq.identification.fit import assemble, check_writable, faults_of, load_logs, tell_starts
 from daq.identification.records import LoggedRecord
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
@@ -77,6 +77,7 @@ class Group:
         assert outcome.estimator is not None
         settings = self.problem.settings.model_copy(update={"seed": outcome.run.seed})
         problem = dataclasses.replace(self.problem, settings=settings)
+        problem = problem.starting(outcome.estimator.estimated_starts_)
         logs = self.training, self.validation
         # Of many runs what each may lack is not worth its time.
         return assemble(problem, outcome.estimator, logs, None, ignore)
@@ -222,6 +223,8 @@ def run_all(
         except Terminated as stop:
             stop.add_note(f"{finished} of {len(runs)} runs had been finished")
             raise
+    fitted = (outcome.estimator for outcome in result.outcomes if outcome.estimator is not None)
+    tell_starts(dict.fromkeys(name for e in fitted for name in e.estimated_starts_), watch)
     if result.failed and len(result.failed) == len(result.outcomes):
         raise ConfigError(result.failed[0].problem)
     if result.interrupted and not result.outcomes:

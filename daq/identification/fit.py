@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -152,8 +152,7 @@ def fit(
     try:
         estimator = _searched(problem, train, folder, watch, resume)
         problem = problem.starting(estimator.estimated_starts_)
-        for name in estimator.estimated_starts_:
-            watch(Note("note", _STARTED.format(name)))
+        tell_starts(estimator.estimated_starts_, watch)
         datasets = [log.dataset for log in train]
         missing = draft.score_tests(problem, estimator, datasets) if draft is not None else None
         result = assemble(problem, estimator, logs, folder, watch, faults)
@@ -171,10 +170,14 @@ def fit(
     return result
 
 
-_STARTED = (
-    "where {0} starts is estimated, as the noise of its first sample would move parameters; "
-    "--set initial.{0}=first keeps it there"
-)
+def tell_starts(names: Iterable[str], watch: Watch) -> None:
+    """Tell of which states a fit has estimated the starts by itself."""
+    for name in names:
+        text = (
+            f"where {name} starts is estimated, as the noise of its first sample would move "
+            f"parameters; --set initial.{name}=first keeps it there"
+        )
+        watch(Note("note", text))
 
 
 def _require_information(problem: Problem, train: Sequence[LoggedRecord]) -> None:

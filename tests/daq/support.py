@@ -402,3 +402,43 @@ def install(folder, module, text, group, name, attribute):
 
 def journal_of(path):
     return [json.loads(line) for line in Path(path).read_text().splitlines()]
+
+
+SLIDE = """
+from sysid import Input, Output, Parameter, ProcessModel, State
+
+model = ProcessModel(
+    name="slide",
+    states=(State("x", "m"), State("v", "m/s")),
+    inputs=(Input("F", "N"),),
+    outputs=(Output("x", "m"),),
+    parameters=(Parameter("friction", "N*s/m", 2.0, 0.2, 20.0, "log"),),
+    derivative=lambda x, u, p: (x[1], (u[0] - p[0] * x[1]) / 0.5),
+)
+"""
+
+
+def slide_model(folder):
+    """A file with a mass on a slide, of which the position is measured; its name as a model."""
+    (folder / "slide.py").write_text(SLIDE)
+    return f"{folder / 'slide.py'}:model"
+
+
+def slide_log(friction):
+    """Its log, the first sample 20 mm off.
+
+    Velocity in closed form: it relaxes towards F / friction by exp(-friction t / mass).
+    """
+    import numpy as np
+    import pandas as pd
+
+    rng, dt = np.random.default_rng(4), 0.02
+    force = np.repeat(rng.uniform(-2.0, 2.0, 30), 10)
+    decay, x, v, rows = np.exp(-friction * dt / 0.5), 0.0, 0.0, []
+    for f in force:
+        rows.append(x)
+        x += f / friction * dt + (v - f / friction) * (1.0 - decay) * 0.5 / friction
+        v = f / friction + (v - f / friction) * decay
+    noisy = np.array(rows) + 0.01 * rng.standard_normal(len(rows))
+    noisy[0] += 0.02
+    return pd.DataFrame({"t": dt * np.arange(len(rows)), "F": force, "x": noisy})

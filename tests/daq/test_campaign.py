@@ -11,7 +11,7 @@ import yaml
 from daq.errors import ConfigError
 from daq.identification import campaign as use_case
 from daq.identification.campaign import Workers, parse_seeds
-from tests.daq.support import rig, start_rig, until
+from tests.daq.support import rig, slide_log, slide_model, start_rig, until
 
 MODELS = """\
 from sysid import Input, Output, Parameter, ProcessModel, State
@@ -99,6 +99,21 @@ def test_every_log_with_every_model_and_seed(folder):
     assert kept["metrics"]["training"][0]["name"] == "slow"
     assert kept["metrics"]["validation"][0]["name"] == "check"
     assert kept["error"]["value"] == best["best"]
+
+
+def test_what_a_campaign_keeps_starts_where_its_fit_did(tmp_path):
+    slide_log(3.0).to_csv(tmp_path / "slide.csv", index=False)
+    model = slide_model(tmp_path)
+    result = rig(
+        "campaign", "slide.csv", "--model", model, "--set", "initial.v=0", "--json", cwd=tmp_path
+    )
+    assert result.returncode == 0 and result.stderr.count("where x starts is estimated") == 1
+    document = json.loads(result.stdout)
+    kept = document["spread"][0]["parameters_file"]
+    replayed = rig("replay", "slide.csv", "--parameters", kept, "--trust", "--json", cwd=tmp_path)
+    assert replayed.returncode == 0, replayed.stderr
+    rmse = json.loads(replayed.stdout)["outputs"]["x"]["rmse_absolute"]
+    assert rmse == pytest.approx(document["runs"][0]["rmse_x"], rel=1e-3) and rmse < 0.0105  # noise
 
 
 @pytest.mark.soak

@@ -15,6 +15,7 @@ from daq.lookup.models import find_model
 from sysid import BatchSimulator, Dataset
 from sysid.judging.score_tests import Finding
 from sysid.problem.faults import DataFault
+from tests.daq.support import slide_log, slide_model
 
 MOTOR = f"{Path(__file__).parents[2] / 'examples' / 'dc_motor.py'}:model"
 COLUMNS = {
@@ -183,39 +184,13 @@ def test_a_speed_in_other_units_is_a_guess_and_no_term_in_the_equations(tmp_path
     assert "is a guess by the size of a gain" in result.next_step.purpose
 
 
-SLIDE = """
-from sysid import Input, Output, Parameter, ProcessModel, State
-
-model = ProcessModel(
-    name="slide",
-    states=(State("x", "m"), State("v", "m/s")),
-    inputs=(Input("F", "N"),),
-    outputs=(Output("x", "m"),),
-    parameters=(Parameter("friction", "N*s/m", 2.0, 0.2, 20.0, "log"),),
-    derivative=lambda x, u, p: (x[1], (u[0] - p[0] * x[1]) / 0.5),
-)
-"""
-
-
 def test_a_position_starts_where_all_samples_say_and_commands_go_on_from_there(tmp_path):
-    """Velocity in closed form: it relaxes towards F / friction by exp(-friction t / mass)."""
-    (tmp_path / "slide.py").write_text(SLIDE)
-    rng, dt, friction = np.random.default_rng(4), 0.02, 3.0
-    force = np.repeat(rng.uniform(-2.0, 2.0, 30), 10)
-    decay, x, v, rows = np.exp(-friction * dt / 0.5), 0.0, 0.0, []
-    for f in force:
-        rows.append(x)
-        x += f / friction * dt + (v - f / friction) * (1.0 - decay) * 0.5 / friction
-        v = f / friction + (v - f / friction) * decay
-    noisy = np.array(rows) + 0.01 * rng.standard_normal(len(rows))
-    noisy[0] += 0.02
-    log = pd.DataFrame({"t": dt * np.arange(len(rows)), "F": force, "x": noisy})
-    model, notes = f"{tmp_path / 'slide.py'}:model", []
+    log, model, notes = slide_log(3.0), slide_model(tmp_path), []
     found = identify(log, model=model, watch=notes.append, initial={"v": 0.0})
     assert any("where x starts is estimated" in getattr(note, "text", "") for note in notes)
     assert found.problem.settings.initial == {"v": 0.0, "x": "estimate"}
     assert abs(found.estimator.initial_states_[0]["x"]) < 0.01
-    assert abs(found.parameters.loc["friction", "value"] - friction) < 0.1
+    assert abs(found.parameters.loc["friction", "value"] - 3.0) < 0.1
     again = identify(log, model=model, initial=found.problem.settings.initial)
     assert again.parameters.loc["friction", "value"] == pytest.approx(
         found.parameters.loc["friction", "value"], rel=1e-3
