@@ -128,6 +128,22 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     )
 
 
+def slopes_along(local: Sensitivity, directions: FloatArray) -> FloatArray:
+    """Slopes along directions (n, n_free) of the search coordinates, (n_residuals, n_outputs, n).
+
+    By differences along each of them: where all parameters of a direction move together and leave
+    the states alone, no kink is passed that any of them would pass by itself.
+    """
+    objective, chromosome = local.objective, local.chromosome
+    sizes = np.max(np.abs(directions) / spans(objective, chromosome), axis=1, initial=0.0)
+    distance = _FILTER_PERTURBATION / np.maximum(sizes, _TINY)
+    at, shift = objective.space.encode(chromosome), distance[:, None] * directions
+    around = objective.space.decode(np.concatenate([at + shift, at - shift]))
+    ahead, behind = np.split(objective.residuals(around, local.steps).values, 2, axis=-1)
+    slopes: FloatArray = local.share[..., None] * (ahead - behind) / (2.0 * distance)
+    return slopes
+
+
 def _without_jumps(slopes: FloatArray, ahead: FloatArray, behind: FloatArray) -> FloatArray:
     """Slopes of one record, those of the smaller side where the sides are a kink apart."""
     apart = np.linalg.norm(ahead - behind, axis=(0, 1))

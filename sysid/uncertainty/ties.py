@@ -12,9 +12,9 @@ from sysid.identifiability.cache import kept_identifiability
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.estimate import Invariant
-from sysid.uncertainty.sensitivity import Sensitivity
+from sysid.uncertainty.sensitivity import Sensitivity, slopes_along
 
-# Of what one parameter of a direction does by itself; slopes of dry friction err by some per cent.
+# Of what one parameter of a direction does by itself.
 _FELT = 0.2
 _NOTHING = 1e-9  # entries of a direction below this are rounding
 
@@ -94,7 +94,9 @@ def ties(sensitivity: Sensitivity) -> Ties:
 def _felt(sensitivity: Sensitivity, directions: FloatArray) -> BoolArray:
     """Which directions (n, n_free) move the outputs of these data all the same, (n,)."""
     apart = np.abs(directions) * np.linalg.norm(sensitivity.rows, axis=0)
-    together = np.linalg.norm(sensitivity.rows @ directions.T, axis=0)
+    counted = sensitivity.objective.weights > 0.0
+    slopes = slopes_along(sensitivity, directions)[:, counted]
+    together = np.linalg.norm(slopes, axis=(0, 1))  # no number where a simulation fails
     felt: BoolArray = together > _FELT * apart.max(axis=1, initial=0.0)
     return felt
 

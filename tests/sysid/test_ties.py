@@ -7,10 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid import Input, Output, Parameter, ProcessModel, State
+from sysid import (
+    BatchSimulator,
+    Dataset,
+    Input,
+    Output,
+    Parameter,
+    ProcessModel,
+    SearchSpace,
+    State,
+)
+from sysid.fitting.objective import Objective
 from sysid.identifiability import cache
 from sysid.identifiability.cache import kept_identifiability
 from sysid.uncertainty.draws import plausible_parameters
+from sysid.uncertainty.sensitivity import sensitivity
+from sysid.uncertainty.ties import ties
 
 
 def shaft_derivative(x, u, p):
@@ -106,3 +118,25 @@ def test_draws_keep_what_the_outputs_determine_however_far_the_others_go():
     assert total.std() == pytest.approx(0.02, rel=0.1)  # as the covariance has it
     assert drawn[:, 2].std() == pytest.approx(0.02, rel=0.1)
     assert low < 0.4 and high > 1.6
+
+
+def test_what_the_equations_tie_no_jump_of_a_single_parameter_unties():
+    """A sample on the very edge of a switch: any change of one inertia alone moves it by two."""
+    edge = shaft(
+        outputs=(Output("omega", "rad/s"), Output("fast", "1")),
+        parameters=tuple(
+            Parameter(name, unit, value, 0.01, 100.0, "log")
+            for name, unit, value in (("J_m", "kg*m^2", 0.25), ("J_b", "kg*m^2", 0.75))
+        ),
+        derivative=lambda x, u, p: (u[0] / (p[0] + p[1]),),
+        output=lambda x, u, p: (x[0], 1.0 if x[0] > 0.5 else -1.0),
+    )
+    inputs, dt = np.ones((17, 1)), 0.0625  # omega is 0.5 at the ninth sample, to the bit
+    speed = dt * np.arange(17.0)
+    record = Dataset(inputs, np.column_stack([speed, np.sign(speed - 0.4)]), dt)
+    objective = Objective(BatchSimulator(edge), SearchSpace.of(edge), [record])
+    local = sensitivity(objective, edge.nominal)
+    own = np.linalg.norm(local.rows, axis=0)
+    assert np.linalg.norm(local.rows @ [1.0, -1.0 / 3.0]) > 0.5 * own.max()
+    (direction,) = ties(local).directions
+    assert direction[0] * 0.25 == pytest.approx(-direction[1] * 0.75)
