@@ -346,7 +346,10 @@ def _identify(
     def is_last(result: Identification) -> bool:
         return ends or bool(_end(request, rounds, result.document))
 
-    identification = fit(problem, logs, [], folder, watch, resume=going_on, examine=is_last)
+    earlier = rounds[-2].as_earlier_fit if len(rounds) > 1 else None
+    identification = fit(
+        problem, logs, [], folder, watch, resume=going_on, examine=is_last, earlier=earlier
+    )
     if identification.interrupted:
         raise KeyboardInterrupt
     if is_last(identification):

@@ -17,6 +17,7 @@ from daq.config import json_file, yaml_file
 from daq.designs.runs import DATA
 from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
+from daq.identification.earlier_fit import EarlierFit
 from daq.identification.request import PARAMETERS
 from daq.logs.capture import COMPLETED, INTERLOCK, RUN_NAME
 
@@ -183,6 +184,19 @@ class Round:
             _interval(quantity, entries.get(quantity["name"], {}))
             for quantity in self.design["quantities"]
         ]
+
+    @property
+    def as_earlier_fit(self) -> EarlierFit | None:
+        """Where an identification with more logs begins; None where this one leaves things open."""
+        result, intervals = self.result, self.intervals()
+        poor = result["verdict"]["parameters"]["trust"] == "poor"
+        if poor or result.get("rivals") or any(i.width is None for i in intervals):
+            return None
+        values = {name: float(entry["value"]) for name, entry in result["parameters"].items()}
+        ends = {
+            i.name: (i.low, i.high) for i in intervals if i.low is not None if i.high is not None
+        }
+        return EarlierFit(values, ends)
 
 
 def _interval(quantity: Mapping[str, Any], entry: Mapping[str, Any]) -> Interval:

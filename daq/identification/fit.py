@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from daq.identification.draft import Draft, Missing
+    from daq.identification.earlier_fit import EarlierFit
     from sysid.gassi import GASSI
     from sysid.gassi import Progress as SearchProgress
     from sysid.uncertainty import Uncertainty
@@ -127,12 +129,14 @@ def fit(
     resume: bool = False,
     examine: Callable[[Identification], bool] = lambda result: True,
     draft: Draft | None = None,
+    earlier: EarlierFit | None = None,
 ) -> Identification:
     """Fit a problem that has been checked to logs.
 
     folder: for ``parameters.yaml``, and while the search runs for what it takes to continue it.
     resume: continue from there. examine: whether what the model may lack is to be tested, which
-    may take longer than the fit. draft: what else can be done meanwhile. Raises ConfigError.
+    may take longer than the fit. draft: what else can be done meanwhile. earlier: where some of the
+    logs have led; nothing is searched for unless all of them disagree. Raises ConfigError.
     """
     train, check = load_logs(problem, training, validation)
     warn(watch, *(log.warning for log in (*train, *check)))
@@ -150,12 +154,16 @@ def fit(
     if folder is not None and not resume:
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     try:
-        estimator = _searched(problem, train, folder, watch, resume)
-        problem = problem.starting(estimator.estimated_starts_)
-        tell_starts(estimator.estimated_starts_, watch)
-        datasets = [log.dataset for log in train]
-        missing = draft.score_tests(problem, estimator, datasets) if draft is not None else None
-        result = assemble(problem, estimator, logs, folder, watch, faults)
+        result, missing = None, None
+        if earlier is not None and not resume:
+            result = _beside(earlier, problem, logs, folder, watch, faults)
+        if result is None:
+            estimator = _searched(problem, train, folder, watch, resume)
+            problem = problem.starting(estimator.estimated_starts_)
+            tell_starts(estimator.estimated_starts_, watch)
+            datasets = [log.dataset for log in train]
+            missing = draft.score_tests(problem, estimator, datasets) if draft is not None else None
+            result = assemble(problem, estimator, logs, folder, watch, faults)
         if examine(result):
             result = examined(result, logs, watch, missing)
     except (KeyboardInterrupt, Terminated) as stop:
@@ -168,6 +176,28 @@ def fit(
         if not result.interrupted:
             request.forget(folder)
     return result
+
+
+def _beside(
+    earlier: EarlierFit,
+    problem: Problem,
+    logs: Split,
+    folder: Path | None,
+    watch: Watch,
+    faults: tuple[DataFault, ...],
+) -> Identification | None:
+    """The minimum of all logs beside that of some; None where it is not the right one."""
+    with contextlib.suppress(ConfigError):  # a simulation that fails there
+        estimator = _searched(problem, logs[0], None, watch, False, earlier.values)
+        interrupted = estimator.stopped_ == "interrupted"
+        if interrupted or earlier.is_near(estimator.parameters_):
+            problem = problem.starting(estimator.estimated_starts_)
+            tell_starts(estimator.estimated_starts_, watch)
+            result = assemble(problem, estimator, logs, folder, watch, faults)
+            if interrupted or earlier.agrees(result):
+                return result
+    watch(Note("note", "the logs together want other parameters than before: a search begins"))
+    return None
 
 
 def tell_starts(names: Iterable[str], watch: Watch) -> None:
@@ -356,7 +386,12 @@ def _fitted(log: LoggedRecord, estimator: GASSI, uncertainty: Uncertainty | None
 
 
 def _searched(
-    problem: Problem, train: Sequence[LoggedRecord], folder: Path | None, watch: Watch, resume: bool
+    problem: Problem,
+    train: Sequence[LoggedRecord],
+    folder: Path | None,
+    watch: Watch,
+    resume: bool,
+    begin: Mapping[str, float] | None = None,
 ) -> GASSI:
     from sysid.gassi import GASSI
 
@@ -371,8 +406,13 @@ def _searched(
     try:
         estimator = GASSI(problem.model, **gassi_settings(problem))
         datasets = [log.dataset for log in train]
-        start = checkpoint if resume else None
-        return estimator.fit(datasets, on_progress=report, checkpoint=checkpoint, resume=start)
+        return estimator.fit(
+            datasets,
+            on_progress=report,
+            checkpoint=checkpoint,
+            resume=checkpoint if resume else None,
+            begin=begin,
+        )
     except ModelError as error:
         if folder is not None and not resume:
             request.forget(folder)

@@ -191,6 +191,7 @@ class GASSI(RecordEstimator):
         on_progress: Callable[[Progress], None] | None = None,
         checkpoint: Path | None = None,
         resume: Path | None = None,
+        begin: Mapping[str, float] | None = None,
     ) -> Self:
         """Search for the parameters with which the model follows the records.
 
@@ -202,6 +203,9 @@ class GASSI(RecordEstimator):
         checkpoint: file that the search's whole state is written to, at most twice a second.
         resume: such a file to go on from, to the same result; further checkpoints go to the same
         file unless another is named.
+        begin: of presets that refine, parameters by name, at which a fit of some of the records
+        has ended, and which these told from all others. Nothing is searched for then: the result
+        is the minimum beside them, of which it is taken that no other looks like it.
 
         Raises ModelError when every simulation of the first generation fails, for records without
         information, settings that make no sense, or a checkpoint of other data, settings or model.
@@ -235,13 +239,14 @@ class GASSI(RecordEstimator):
         searched = objective
         if self.excerpt_ is not None:
             searched = objective.on(self.excerpt_.datasets(), self.excerpt_.places)
-        run = self._search_run(searched, preset)
+        begin = begin if preset.refine else None
+        run = self._search_run(searched, preset, begin)
         checkpoints = self._checkpoints(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
         self.stopped_ = self._search(run, checkpoints, notify)
         self._set_run(run)
         try:
-            self._conclude(run, objective, notify)
+            self._conclude(run, objective, notify, settled=begin is not None)
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
         return self
@@ -269,11 +274,16 @@ class GASSI(RecordEstimator):
         return "converged" if run.search.converged else "generations"
 
     def _conclude(
-        self, run: SearchRun, objective: Objective, notify: Callable[[Progress], None]
+        self,
+        run: SearchRun,
+        objective: Objective,
+        notify: Callable[[Progress], None],
+        *,
+        settled: bool,
     ) -> None:
         """Fit the minima of a search to all of the records, and keep the best.
 
-        objective: of the records, over the parameters alone.
+        objective: of the records, over the parameters alone. settled: whether there are no others.
         """
         iterations = itertools.count(1)
 
@@ -290,14 +300,14 @@ class GASSI(RecordEstimator):
             return
         if excerpt is None:
             if weighs:
-                self._maximise_likelihood(searched, run.minima(), watch)
+                self._maximise_likelihood(searched, run.minima(), watch, settled=settled)
             return
         if weighs:
             # What looks like a filter's minimum it tells itself, by all of the records.
-            lookalike = self.criterion_ != "innovations"
+            lookalike = not settled and self.criterion_ != "innovations"
             minima = promising(searched, run.minima(), watch, lookalike=lookalike)
             minima = excerpt.on_all(searched.space, minima)[1]
-            self._maximise_likelihood(objective, minima, watch, explored=True)
+            self._maximise_likelihood(objective, minima, watch, explored=True, settled=settled)
             return
         minima = excerpt.on_all(searched.space, run.minima())[1]
         ends = refine_each(objective, [begin(objective, minimum) for minimum in minima])
@@ -311,10 +321,14 @@ class GASSI(RecordEstimator):
         watch: Callable[[Point], None],
         *,
         explored: bool = False,
+        settled: bool = False,
     ) -> None:
-        """Refit the minima of the mean RMSE by likelihood, and keep the likeliest."""
+        """Refit the minima of the mean RMSE by likelihood, and keep the likeliest.
+
+        explored, settled: as of ``fit_likelihood``.
+        """
         noise, process = _OF_NOISY_INPUTS.get(self.criterion_), self._process()
-        fit = partial(fit_likelihood, watch=watch, noise=noise, process=process)
+        fit = partial(fit_likelihood, watch=watch, noise=noise, process=process, settled=settled)
         result = fit(objective, minima, explored=explored)
         likeliest = result.optimum
         if not (isinstance(likeliest.objective, Innovations) and likeliest.objective.corrects):
@@ -575,15 +589,29 @@ class GASSI(RecordEstimator):
             raise ModelError("every output has weight 0; at least one must count")
         return weights
 
-    def _search_run(self, objective: Objective, preset: Preset) -> SearchRun:
+    def _search_run(
+        self, objective: Objective, preset: Preset, begin: Mapping[str, float] | None
+    ) -> SearchRun:
         # The genetic search gets its share of the generations, local refinement the rest.
         generations = self.generations
         if preset.refine and generations > 0:
             generations = max(1, round((1.0 - preset.local_share) * generations))
         rng = np.random.default_rng(self.random_state)
         rule = self.elite_percent, self.minimum_generations, self.termination_ratio
-        search = GeneticSearch(self.space_, preset, self.population, generations, rng, *rule)
+        population, chromosome = self.population, None
+        if begin is not None:
+            # So few simulations leave the local search nothing but its last descent.
+            population, generations, chromosome = 2, 1, self._nearest(begin)
+        search = GeneticSearch(
+            self.space_, preset, population, generations, rng, *rule, begin=chromosome
+        )
         return SearchRun(objective, search, self.generations, self.criterion_ != "error")
+
+    def _nearest(self, values: Mapping[str, float]) -> FloatArray:
+        """The chromosome (n_free,) in the ranges nearest to values by name, else the nominal."""
+        space = self.space_
+        wanted = [values.get(parameter.name, parameter.nominal) for parameter in space.parameters]
+        return np.clip(wanted, space.lower, space.upper)
 
     def _checkpoints(
         self, data: Sequence[Dataset], run: SearchRun, checkpoint: Path | None, resume: Path | None

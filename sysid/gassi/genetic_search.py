@@ -81,6 +81,7 @@ class GeneticSearch:
     generations: how many are evaluated, i_max. elite_percent: r_elite. minimum_generations,
     termination_ratio: i_min and r_termination of (4.11); with 0 only the generations count. After
     each ``tell``: ``elite`` (n_free,), its error and feasibility, and its ``history`` of errors.
+    begin: (n_free,), the chromosome that all of the first population are, drawn without one.
     """
 
     space: SearchSpace
@@ -91,6 +92,7 @@ class GeneticSearch:
     elite_percent: float = 0.5
     minimum_generations: int = 0
     termination_ratio: float = 0.0
+    begin: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.population < 2:
@@ -106,6 +108,8 @@ class GeneticSearch:
         self.converged = False
         self._elite_rank = _UNRANKED
         self._start()
+        if self.begin is not None:
+            self._coded = np.repeat(self.space.encode(self.begin)[None], self.population, axis=0)
         self._initial_spread = self._coded.std(axis=0)
         self._kept = np.empty((0, len(self.space.parameters)))
         self._kept_behind: BoolArray = np.empty(0, dtype=bool)

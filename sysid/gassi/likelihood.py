@@ -98,18 +98,20 @@ def fit_likelihood(
     noise: NoisyInputs | None = None,
     process: FloatArray | None = None,
     explored: bool = False,
+    settled: bool = False,
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
     noise: how all of them are refitted in the end, where inputs or the process are noisy; by
     innovations, too, where free runs would not do. process: as of ``Innovations``. explored:
-    whether the minima have their lookalikes among them.
+    whether the minima have their lookalikes among them. settled: whether there are none, to a
+    filter neither.
     """
     objective = accurate(objective, minima[0])
     # A filter begins at the minima of free runs, and does not end there; what looks like a minimum
     # it tells itself.
     roughly = noise == "innovations"
-    lookalike = not (explored or roughly)
+    lookalike = not (explored or settled or roughly)
     optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=roughly)
     if not roughly:
         objective, optima = _in_noise(objective, optima, watch)
@@ -118,7 +120,8 @@ def fit_likelihood(
     if noise is not None:
         for corrects in (False, True) if noise == "compensated" else (True,):
             fit = partial(noisy_fit, corrects, process, objective)
-            refitted = refitted or _refitted(fit, objective, [best, *others], optima, watch)
+            ranked = [best, *others]
+            refitted = refitted or _refitted(fit, objective, ranked, optima, watch, settled=settled)
     if refitted is not None:
         optima = refitted
         best, *others = optima.ranked()
@@ -368,6 +371,8 @@ def _refitted(
     ranked: Sequence[Optimum],
     by_error: _Optima,
     watch: Watch | None,
+    *,
+    settled: bool,
 ) -> _Optima | None:
     """The best optimum and those not told from it by the error, refitted for noisy inputs.
 
@@ -375,7 +380,7 @@ def _refitted(
     are refitted, and compared, at the noise of the first, and the best of them by its own. A
     filter tells minima apart that free runs do not, and others look like its own. Free runs may
     lead it to a poor one, whose noise is too large to compare by: from one that is far better all
-    begins anew at its noise.
+    begins anew at its noise. settled: whether nothing looks like the first.
     """
     first = fit(ranked[0], watch)
     if first is None:
@@ -391,7 +396,8 @@ def _refitted(
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break
         explored = best
-        starts += lookalikes(first.objective, best.chromosome) if filters else []
+        explores = filters and not settled
+        starts += lookalikes(first.objective, best.chromosome) if explores else []
         exact = _exact_among(first, starts) if filters else None
         if exact is not None:
             optima = _Optima.around(exact, objective, too_well)

@@ -1,0 +1,47 @@
+"""Where an identification begins that has the logs of an earlier one and more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sysid.judging.assessment import coloured_innovations
+
+if TYPE_CHECKING:
+    from daq.identification.result import Identification
+
+_FARTHEST = 2.0  # half widths of its interval, by which more logs may move a quantity
+
+
+@dataclass(frozen=True)
+class EarlierFit:
+    """Where an identification from some of the logs has ended, and left nothing open.
+
+    values: parameters by name. intervals: the 95 % intervals of all that logs can tell.
+    """
+
+    values: Mapping[str, float]
+    intervals: Mapping[str, tuple[float, float]]
+
+    def is_near(self, values: Mapping[str, float]) -> bool:
+        """Whether no value of a quantity by its name lies far beyond the interval that it had."""
+        return all(
+            abs(values[name] - 0.5 * (low + high)) <= _FARTHEST * 0.5 * (high - low)
+            for name, (low, high) in self.intervals.items()
+            if name in values
+        )
+
+    def agrees(self, result: Identification) -> bool:
+        """Whether the minimum beside it explains all logs alike, and stays near its intervals.
+
+        What the earlier logs rule out more logs rule out as well, unless these say that the
+        earlier minimum was not the right one.
+        """
+        uncertainty = result.uncertainty
+        if uncertainty is None or uncertainty.disagreement > 1.0:
+            return False
+        if coloured_innovations(uncertainty).any():
+            return False
+        values = {estimate.name: estimate.value for estimate in uncertainty.determined()}
+        return self.intervals.keys() <= values.keys() and self.is_near(values)

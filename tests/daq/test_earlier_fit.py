@@ -1,0 +1,67 @@
+"""An identification that has the logs of an earlier one and more begins where that one ended."""
+
+import pytest
+
+from daq import record
+from daq.identification.earlier_fit import EarlierFit
+from daq.identification.fit import fit
+from daq.identification.request import SettingsRequest
+from daq.identification.settings import problem_of
+from daq.progress import Note
+from tests.daq.support import few_free, write_experiment, write_yaml
+
+ANEW = "the logs together want other parameters than before: a search begins"
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """A problem of two free parameters, two logs, and what the first of them tells."""
+    folder = tmp_path_factory.mktemp("start")
+    config = write_yaml(folder / "few.yaml", few_free("R_m", "K_m"))
+    problem = problem_of(SettingsRequest(str(config), {"model": "actuator"}))
+    long = {"duration": 1.25, "calibration": {"samples": 3200}}  # so that its noise is known
+    experiments = [
+        write_experiment(folder / f"{seed}.yaml", motor={"seed": seed}, **long) for seed in (3, 4)
+    ]
+    logs = [
+        record(file, out=folder / "runs", options={"seed": seed}).folder / "log.csv"
+        for seed, file in enumerate(experiments)
+    ]
+    earlier = fit(problem, logs[:1], [], examine=lambda result: False)
+    return problem, logs, earlier
+
+
+def of(result):
+    """Values and intervals of the parameters that are free."""
+    estimates = result.uncertainty.parameters[:2]
+    values = {estimate.name: estimate.value for estimate in estimates}
+    return values, {e.name: (e.low, e.high) for e in estimates}
+
+
+def identified(case, earlier):
+    problem, logs, _ = case
+    said = []
+    result = fit(
+        problem, logs, [], None, said.append, examine=lambda result: False, earlier=earlier
+    )
+    return result, [note.text for note in said if isinstance(note, Note)]
+
+
+def test_it_comes_to_what_a_search_comes_to_without_one(case):
+    searched, _ = identified(case, None)
+    begun, notes = identified(case, EarlierFit(*of(case[2])))
+    assert ANEW not in notes
+    assert begun.estimator.n_simulations_ < 0.5 * searched.estimator.n_simulations_
+    for name, (low, high) in of(searched)[1].items():
+        value = of(searched)[0][name]
+        assert of(begun)[0][name] == pytest.approx(value, abs=0.1 * (high - low))
+        assert of(begun)[1][name] == pytest.approx((low, high), rel=0.02)
+
+
+def test_a_start_that_all_logs_speak_against_leads_to_a_search(case):
+    values, ends = of(case[2])
+    wrong = {name: (1.2 * low, 1.2 * high) for name, (low, high) in ends.items()}
+    searched, _ = identified(case, None)
+    begun, notes = identified(case, EarlierFit({n: 1.2 * v for n, v in values.items()}, wrong))
+    assert ANEW in notes
+    assert of(begun) == of(searched)
