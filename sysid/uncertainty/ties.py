@@ -87,6 +87,8 @@ def ties(sensitivity: Sensitivity) -> Ties:
         tied = Ties(_directions(sensitivity, model), combinations)
     else:
         tied = Ties.of(space, sensitivity.chromosome, combinations, members)
+    if not len(tied.directions):
+        return tied
     # What a start without exception leaves alone may act where a log has gone since.
     return replace(tied, directions=tied.directions[~_felt(sensitivity, tied.directions)])
 
