@@ -25,7 +25,8 @@ from sysid.threads import one_thread
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
-    from sysid.judging.score_tests import Finding, ScoreTests
+    from sysid.judging.findings import Finding
+    from sysid.judging.score_tests import ScoreTests
     from sysid.uncertainty import Uncertainty
 
     Missing = Callable[[Uncertainty], tuple[Finding, ...]]

@@ -13,7 +13,7 @@ from daq.notation import shortest
 from sysid.problem.faults import DataFault
 
 if TYPE_CHECKING:
-    from sysid.judging.score_tests import Finding
+    from sysid.judging.findings import Finding
 
 _WIDER = 10.0  # by which factor a range is widened
 _ALIKE = 0.02  # by which a gain may differ from that between two units

@@ -384,7 +384,7 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
 
 def _missing(identification: Identification) -> dict[str, Any]:
     """What score tests found, and the variant that was fitted for it."""
-    from sysid.judging.score_tests import description
+    from sysid.judging.findings import description
 
     suspicion, command = identification.suspicion, identification.alternative_command
     assert suspicion is not None

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.judging.comparison import Candidate, Comparison, compare
-from sysid.judging.score_tests import Finding, description, moves_of
+from sysid.judging.findings import Finding, description, moves_of
 from sysid.judging.suspects import input_noise, variants_of
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent, mean_known

@@ -17,9 +17,9 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.innovations import MISJUDGED
 from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
+from sysid.judging.findings import MOVED, Finding, description
 from sysid.judging.residual_patterns import errors_alone, errors_by_speed, shared_errors
 from sysid.judging.residual_tests import ResidualTest, residual_test
-from sysid.judging.score_tests import MOVED, Finding, description
 from sysid.judging.starts import Starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault

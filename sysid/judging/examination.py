@@ -12,8 +12,9 @@ from sysid.judging.alternatives import Alternative, best_alternative, moved_by_n
 from sysid.judging.assessment import RecordResult, Verdict, examine, judge
 from sysid.judging.exchanges import exchanged_channels
 from sysid.judging.expected_errors import expected_errors
+from sysid.judging.findings import Finding
 from sysid.judging.lags import lag_faults
-from sysid.judging.score_tests import Finding, ScoreTests, missing_physics
+from sysid.judging.score_tests import ScoreTests, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import data_faults

@@ -18,8 +18,8 @@ from scipy.special import chdtrc
 
 from sysid.arrays import FloatArray
 from sysid.judging.evidence import independent_samples
+from sysid.judging.findings import Finding, moves_of
 from sysid.judging.residual_tests import residual_test
-from sysid.judging.score_tests import Finding, moves_of
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent
 from sysid.problem.model import Input, ModelError, Output

@@ -13,7 +13,7 @@ from daq.config.identification import IdentificationConfig
 from daq.identification.remedies import remedies
 from daq.lookup.models import find_model
 from sysid import BatchSimulator, Dataset
-from sysid.judging.score_tests import Finding
+from sysid.judging.findings import Finding
 from sysid.problem.faults import DataFault
 from tests.daq.support import slide_log, slide_model
 

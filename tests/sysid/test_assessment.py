@@ -13,7 +13,7 @@ from sysid.judging.alternatives import Alternative
 from sysid.judging.assessment import examine, judge
 from sysid.judging.comparison import Comparison
 from sysid.judging.expected_errors import ExpectedErrors
-from sysid.judging.score_tests import Finding, Move
+from sysid.judging.findings import Finding, Move
 from sysid.problem.faults import DataFault
 from sysid.problem.terms import AddedTerm
 from sysid.uncertainty import Ambiguity, Estimate, Uncertainty

@@ -26,7 +26,7 @@ from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessMode
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.examination import suspected, verdict_of
-from sysid.judging.score_tests import colour_about_line
+from sysid.judging.whitener import colour_about_line
 from tests.soak import mostly_soak
 from tests.sysid.reference import simulate
 

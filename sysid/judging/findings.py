@@ -1,0 +1,133 @@
+"""What score tests find: what a model lacks, how sure that is, what it moves, and in what words."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from sysid.judging.suspects import Kind
+from sysid.problem.terms import AddedTerm
+from sysid.uncertainty import Estimate
+
+# Standard deviations by which a finding moves a parameter noticeably: an interval reaches 1.96. And
+# share of the residuals that it explains, from where it counts whatever it moves.
+MOVED, _LARGE = 1.5, 0.25
+_NEARLY_ALL = 0.9  # of what is left, beside which a line's guess leaves what looks like anything
+_TURNED = -1.3  # change of a gain that is 1, below which it is its sign that is wrong
+
+
+@dataclass(frozen=True)
+class Move:
+    """By how much a finding would move a quantity, in its unit and in standard deviations."""
+
+    quantity: Estimate
+    change: float
+    deviations: float
+
+
+def moves_of(estimates: Iterable[Estimate], changes: Iterable[float]) -> tuple[Move, ...]:
+    """Moves of the estimates that have a deviation, the farthest first."""
+    moves = [
+        Move(e, c, c / e.deviation) for e, c in zip(estimates, changes, strict=True) if e.deviation
+    ]
+    return tuple(sorted(moves, key=lambda move: -abs(move.deviations)))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that the model lacks: what it is, how sure, and what it would move.
+
+    name, unit: as of its suspect. amplitude: of a channel's fault, in the unit; None of others.
+    term: of a function the one that it is most like, with a range to fit it in. of_input: whether
+    a channel is an input. p_value: by chance,
+    all tests counted. share: of the whitened residuals' squares that it explains. moves: the
+    farthest first.
+    """
+
+    kind: Kind
+    name: str
+    unit: str
+    amplitude: float | None
+    p_value: float
+    share: float
+    moves: tuple[Move, ...]
+    term: AddedTerm | None = None
+    of_input: bool = False
+
+    @property
+    def farthest(self) -> float:
+        """Standard deviations by which it moves what it moves farthest."""
+        return abs(self.moves[0].deviations) if self.moves else 0.0
+
+    @property
+    def counts(self) -> bool:
+        """Whether it moves a parameter noticeably, or is much of what is left."""
+        return self.farthest > MOVED or self.share > _LARGE
+
+    @property
+    def comes_late(self) -> bool:
+        """Whether it is a channel's delay, or what is one of a little."""
+        return self.kind in ("delay", "filter", "lag")
+
+    @property
+    def explains(self) -> bool:
+        """Whether next to nothing is left with a channel's fault taken out."""
+        return self.amplitude is not None and self.share > _NEARLY_ALL
+
+    @property
+    def turned_round(self) -> bool:
+        """Whether a channel has the opposite sign of what the model has."""
+        return self.kind == "gain" and (self.amplitude or 0.0) < _TURNED
+
+
+_WORDS = {
+    "delay": "{name} is logged {amplitude:.3g} s {late}",
+    "filter": "{name} is logged through a filter of {amplitude:.3g} s",
+    "lag": "{name} acts with a lag of {amplitude:.3g} s",
+    "play": "{name} acts through play (hysteresis) of {amplitude:.3g} {unit}",
+    "offset": "{name} is {amplitude:.3g} {unit} off{instead}",
+    "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on{instead}",
+    "noise": "{name} is logged with noise of {amplitude:.2g} {unit}, which has not acted",
+    "saturation": "{name} saturates near its largest values",
+    "exchange": "{name} have changed places in the log",
+}
+
+
+def description(finding: Finding) -> str:
+    """A finding in a few words."""
+    amplitude, unit = finding.amplitude, "" if finding.unit == "1" else finding.unit
+    if finding.kind == "variant":
+        return finding.name
+    if finding.term is not None:
+        return _term_text(finding.term)
+    if finding.kind == "disturbance":
+        return f"a slow signal in d{finding.name}/dt that nobody measured"
+    assert amplitude is not None
+    if finding.kind == "change":
+        change = f"{100.0 * amplitude:+.{0 if abs(amplitude) >= 0.01 else 2}f} % of its value"
+        return f"{finding.name} changes by {change} from a record's first to last sample"
+    if finding.kind == "gain":
+        times = f"is {1.0 + amplitude:.3g} times what"
+        is_what = "has the opposite sign of what" if finding.turned_round else times
+        return f"{finding.name} {is_what} the model has"
+    early = "early, or acts so much later" if finding.of_input else "early, or its inputs so late"
+    late = "late" if amplitude > 0.0 else early
+    instead = ", or something not measured acts like it" if finding.of_input else ""
+    text = _WORDS[finding.kind]
+    size = abs(amplitude) if finding.kind == "delay" else amplitude
+    return (
+        text.format(name=finding.name, late=late, amplitude=size, unit=unit, instead=instead)
+        .replace("  ", " ")
+        .strip()
+    )
+
+
+def _term_text(term: AddedTerm) -> str:
+    """A term in a few words."""
+    equation = f"d{term.equation}/dt"
+    if term.shape == "stribeck":
+        return (
+            f"a term in {term.of} near its zero in {equation}, like friction that is larger near "
+            "standstill (Stribeck)"
+        )
+    if term.shape == "sign" and term.of == term.equation and term.centre == 0.0:
+        return f"a term in the sign of {term.of} in {equation}, like dry friction"
+    return f"a term in {term.of} ({term.shape}) in {equation}"

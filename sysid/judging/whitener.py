@@ -1,0 +1,126 @@
+"""Residuals and changes of the outputs, whitened by the residuals' autoregression."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.uncertainty.colour import Autoregression, colour, longest_memory, record_rows
+from sysid.uncertainty.sensitivity import Sensitivity
+
+_FORGETS = 20  # samples of a record that count as independent, from where its mean is no colour
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """Takes the residuals' colour out of columns (n_residuals, n_outputs, k): (n_rows, k).
+
+    kept: rows whose past the autoregression knows. decorrelate: (n_outputs, n_outputs).
+    """
+
+    model: Autoregression
+    lengths: tuple[int, ...]
+    kept: BoolArray
+    decorrelate: FloatArray
+
+    @classmethod
+    def of(cls, local: Sensitivity, residual: FloatArray) -> Self:
+        """By residuals (n_residuals, n_outputs); of outputs that do not count none are left."""
+        counted = local.objective.weights > 0.0
+        measured = counted & local.seen
+        residual = np.where(measured, residual, 0.0)
+        model = colour_about_line(residual, local.seen, measured, local.lengths)
+        values, vectors = np.linalg.eigh(model.noise)
+        floor = 1e-12 * max(float(values[-1]), 1e-300)
+        roots = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), 0.0)
+        whole = np.all(local.seen | ~local.seen.any(axis=0), axis=1)
+        kept, order = whole.copy(), len(model.coefficients)
+        for rows in record_rows(local.lengths):
+            for k in range(1, order + 1):
+                kept[rows][k:] &= whole[rows][:-k]
+            kept[rows][:order] = False
+        return cls(model, local.lengths, kept, (vectors * roots) @ vectors.T)
+
+    @cached_property
+    def n_outputs(self) -> int:
+        """Columns of the residuals."""
+        return len(self.decorrelate)
+
+    @cached_property
+    def _filter(self) -> FloatArray:
+        """What makes a sample of it and those before, the oldest first, (q, (order + 1) q)."""
+        parts = [-matrix for matrix in self.model.coefficients[::-1]]
+        whole: FloatArray = self.decorrelate @ np.hstack([*parts, np.eye(self.n_outputs)])
+        return whole
+
+    def __call__(self, columns: FloatArray) -> FloatArray:
+        """The whitened columns, rows of outputs one after another."""
+        whole = np.zeros((self.n_outputs * int(self.kept.sum()), columns.shape[2]))
+        for rows, places in self._records:
+            if columns[rows].any():
+                whole[places] = self.of_record(rows, columns[rows])
+        return whole
+
+    @cached_property
+    def _records(self) -> list[tuple[slice, slice]]:
+        """Each record's rows of the residuals and of the whitened columns."""
+        return [(rows, self.rows_of(rows)) for rows in record_rows(self.lengths)]
+
+    def of_record(self, rows: slice, columns: FloatArray) -> FloatArray:
+        """Those of one record, (n_samples, n_outputs, k), by its rows of the residuals."""
+        _, q, k = columns.shape
+        felt = columns.any(axis=(0, 1))
+        whole = np.zeros((q * int(self.kept[rows].sum()), k))
+        order = len(self.model.coefficients)
+        flat = np.ascontiguousarray(columns[..., felt]).reshape(len(columns) * q, -1)
+        past = sliding_window_view(flat, (order + 1) * q, axis=0)[::q].swapaxes(1, 2)
+        white: FloatArray = (self._filter @ past)[self.kept[rows][order:]]
+        whole[:, felt] = white.reshape(len(whole), -1)
+        return whole
+
+    def back(self, rows: slice, white: FloatArray) -> FloatArray:
+        """Of columns' products with whitened ones (n_rows, k) what these are with any, of a record.
+
+        Its transpose: (n_samples * n_outputs, k), by the record's rows of the residuals.
+        """
+        q, order = self.n_outputs, len(self.model.coefficients)
+        kept = self.kept[rows]
+        whole = np.zeros((len(kept), white.shape[1], q))
+        whole[kept] = white[self.rows_of(rows)].reshape(-1, q, white.shape[1]).swapaxes(1, 2)
+        pieces = whole[order:] @ self._filter  # (n_samples - order, k, (order + 1) q)
+        back = np.zeros_like(whole)
+        for lag in range(order + 1):
+            back[lag : lag + len(pieces)] += pieces[..., lag * q : (lag + 1) * q]
+        flat: FloatArray = back.swapaxes(1, 2).reshape(len(kept) * q, -1)
+        return flat
+
+    def rows_of(self, rows: slice) -> slice:
+        """Rows of the whitened columns of one record, by its rows of the residuals."""
+        first = int(self.kept[: rows.start].sum())
+        count = int(self.kept[rows].sum())
+        return slice(self.n_outputs * first, self.n_outputs * (first + count))
+
+
+def colour_about_line(
+    residual: FloatArray, seen: BoolArray, measured: BoolArray, lengths: tuple[int, ...]
+) -> Autoregression:
+    """Colour of residuals (n, q) about offset and drift, of outputs that forget soon enough.
+
+    These are no colour: an autoregression would take them for a memory without end, and
+    whitening would erase them. Of noise that is nearly as slow as a record they are part. Each
+    record has a line of its own: what is off in one of several is no slow noise of all.
+    """
+    line = np.zeros_like(residual)
+    for rows in record_rows(lengths):
+        for j in np.flatnonzero(measured[rows].any(axis=0)):
+            at = rows.start + np.flatnonzero(measured[rows, j])
+            time = at - at.mean()
+            slope = (time @ residual[at, j]) / max(float(time @ time), 1.0)
+            line[at, j] = residual[at, j].mean() + slope * time
+    centred = residual - line
+    model = colour(centred, seen, lengths)
+    soon = _FORGETS * longest_memory(model, np.mean(centred**2, axis=0)) <= min(lengths)
+    return model if soon.all() else colour(residual - np.where(soon, line, 0.0), seen, lengths)
