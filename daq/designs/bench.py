@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from threading import Lock
 
 import numpy as np
-import numpy.typing as npt
 
 from daq.config.rig import RigConfig
 from daq.designs.knowledge import expected_jitter, speed_noise
@@ -111,14 +110,9 @@ class PlantBench:
                 return None
             for name, values in measured.items():
                 signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values
-        others = np.arange(1, min(_FOLLOWED, len(vectors)))
-        if not self._identified:  # of wide ranges the slow ones are soon computed
-            others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
-        astray = self._astray(inputs, dt, vectors[others], int(steps[others].max(initial=1)))
-        moves = [{name: s[place] for name, s in signals.items()} for place in (0, *others)]
-        struck = np.array([not self._accelerates(inputs, dt, of_it) for of_it in moves], dtype=bool)
-        at_most = 0.0 if self._identified else _MINORITY * (1 + len(others))
-        if struck[0] or np.sum(astray | struck[1:]) > at_most:
+        runs = [{name: s[k] for name, s in signals.items()} for k in range(len(vectors))]
+        struck = not all(self._accelerates(inputs, dt, run) for run in runs)
+        if struck or self._lead_astray(inputs, dt, vectors, steps):
             return None
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
 
@@ -201,17 +195,25 @@ class PlantBench:
             return False
         return True
 
-    def _astray(
-        self, inputs: FloatArray, dt: float, vectors: FloatArray, n_steps: int
-    ) -> npt.NDArray[np.bool_]:
-        """Which of several vectors lead the model astray, (n,)."""
-        signals = self._run(self._scale * inputs, dt, vectors, n_steps)
-        of_each = [{name: s[k : k + 1] for name, s in signals.items()} for k in range(len(vectors))]
+    def _lead_astray(
+        self, inputs: FloatArray, dt: float, vectors: FloatArray, steps: IntArray
+    ) -> bool:
+        """Whether more vectors than may, behind the first, lead the model astray.
+
+        steps: of each, (n,).
+        """
+        others = np.arange(1, min(_FOLLOWED, len(vectors)))
+        if not self._identified:  # of wide ranges the slow ones are soon computed
+            others = 1 + np.argsort(steps[1:], kind="stable")[: _FOLLOWED - 1]
+        n_steps = int(steps[others].max(initial=1))
+        signals = self._run(self._scale * inputs, dt, vectors[others], n_steps)
+        of_each = [{name: s[k : k + 1] for name, s in signals.items()} for k in range(len(others))]
         astray = [
             self._leads_astray(inputs, dt, vector, larger, n_steps)
-            for vector, larger in zip(vectors, of_each, strict=True)
+            for vector, larger in zip(vectors[others], of_each, strict=True)
         ]
-        return np.array(astray, dtype=bool)
+        at_most = 0.0 if self._identified else _MINORITY * (1 + len(others))
+        return sum(astray) > at_most
 
     def _leads_astray(
         self,

@@ -79,6 +79,20 @@ def test_a_run_beyond_any_limit_is_refused(limits, motor):
     assert tight.records(commands(motor), 1.0 / 800.0, vectors) is None
 
 
+def test_what_looks_like_a_blow_with_any_of_the_parameters_is_refused():
+    loose, vectors = bench()
+    inertias = [name in ("J_m", "J_b") for name in actuator().parameter_names]
+    light = np.where(inertias, 0.3, 1.0) * vectors  # accelerates three times as fast
+    motion = loose.signals(commands(0.6), 1.0 / 800.0, vectors)["omega"]
+    peak = float(np.abs(np.diff(motion)).max() * 800.0)
+    tight, _ = bench(encoder={"acceleration": 2.0 * peak})
+    alike = np.repeat(vectors, 16, axis=0)
+    mixed = np.vstack([alike[1:], light])
+    assert loose.records(commands(0.6), 1.0 / 800.0, mixed) is not None
+    assert tight.records(commands(0.6), 1.0 / 800.0, alike) is not None
+    assert tight.records(commands(0.6), 1.0 / 800.0, mixed) is None
+
+
 def test_a_limit_is_kept_by_the_margin():
     config = load_rig("simulated.yaml")[0]
     loose, vectors = bench()
