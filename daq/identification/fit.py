@@ -16,6 +16,7 @@ import numpy as np
 from daq.errors import ConfigError, Terminated
 from daq.identification import records, request
 from daq.identification.foreign import ColumnMapping
+from daq.identification.placement import placement_faults
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
 from daq.identification.result import FittedLog, Identification
@@ -288,6 +289,7 @@ def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
     for part, records_of_part in zip(parts, logs, strict=True):
         if not records_of_part:
             continue
+        units += placement_faults(model, records_of_part, part)
         datasets = [log.dataset for log in records_of_part]
         try:
             units += implausible(model, _space(problem), datasets, part)

@@ -27,6 +27,7 @@ FaultKind = Literal[
     "unit",
     "lag",
     "start",
+    "place",
 ]
 
 Role = Literal["command", "input", "sensor"]

@@ -8,12 +8,14 @@ import pytest
 import yaml
 from scipy.io import savemat
 
-from daq import ConfigError, identify
+from daq import ConfigError, identify, record
 from daq.identification import records
+from daq.identification.fit import faults_of, load_logs
 from daq.identification.replay import read_parameters
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.logs.table import read_table
+from daq.lookup.shipped import find_file
 from sysid.examples import lag_record
 from tests.daq.support import OF_LAG, rig
 
@@ -347,3 +349,17 @@ def test_terms_are_added_to_a_model_and_kept_in_its_result(folder):
 def test_a_term_that_is_none_is_named(folder, change, named):
     with pytest.raises(ConfigError, match=named):
         settled(folder, terms=[{**RUBBING, **change}])
+
+
+def test_a_sensor_between_motor_and_brake_is_not_taken_for_one_at_the_load(tmp_path):
+    text = find_file("protocol", "constant_velocity.yaml").read_text(encoding="utf-8")
+    quick = {"velocities": [20.0], "brake_commands": [0.0], "measure": 0.5}
+    (tmp_path / "quick.yaml").write_text(yaml.safe_dump({**yaml.safe_load(text), **quick}))
+    run = record(tmp_path / "quick.yaml", options={"seed": 0}, out=tmp_path)
+    sentences = {}
+    for model in ("actuator", "actuator:load=free,sensor=between"):
+        problem = problem_of(SettingsRequest(None, {"model": model}))
+        faults = faults_of(problem, load_logs(problem, [run.folder], []))
+        sentences[model] = [fault.sentence for fault in faults if fault.kind == "place"]
+    assert "--model actuator:load=free,sensor=between" in sentences["actuator"][0]
+    assert not sentences["actuator:load=free,sensor=between"]
