@@ -16,6 +16,9 @@ settings.load_profile("repeatable")
 def pytest_configure(config):
     _hear_signals()
     _keep_bytecode()
+    # Tests run beside each other, each with the programs that it starts. Threads that share a small
+    # matrix wait for each other, which was a sixth of what tests of linear algebra took.
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     if not hasattr(config, "workerinput"):
         # Compiled kernels are kept for the next session, as pytest's own cache is, and shared by
         # all processes: those of pytest-xdist and programs that tests start find the folder by

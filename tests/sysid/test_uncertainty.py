@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.linalg import block_diag, toeplitz
 from scipy.signal import lfilter
-from threadpoolctl import threadpool_limits
 
 from benchmarks._common import simulated_logs
 from sim_rig.actuator import actuator
@@ -43,13 +42,6 @@ from sysid.uncertainty.ties import Ties
 from tests.sysid.support import Formula, lag, linear_response, prbs
 
 Z = 1.959963984540054
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Threads that share a small matrix wait for each other more than they compute."""
-    with threadpool_limits(1, user_api="blas"):
-        yield
 
 
 # --- covariance of a score ----------------------------------------------------------------------
