@@ -91,7 +91,8 @@ def wound_up(model: ProcessModel, turns: float) -> dict[str, float]:
     theta = 2.0 * math.pi * turns
     length = values["radius"] * (math.hypot(theta, _CROSSOVER) - _CROSSOVER)
     height = length - values["mass"] * GRAVITY / values["k_cable"]
-    return {"theta": theta, "height": height, "z": -1.0}
+    deflection = 1.0 / values.get("zeta", 1.0)  # LuGre's is an angle, of others a share
+    return {"theta": theta, "height": height, "z": -deflection}
 
 
 def hand_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any]:

@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+from sim_rig.actuator import actuator
 from sim_rig.physics.loads import HAND_DAMPING, HAND_STIFFNESS, LOADS, hand_torque, pulley_torque
+from sysid import BatchSimulator, Dataset
 from tests.sim_rig.support import Parts, constant, follow
 
 GRAVITY = 9.80665
@@ -277,3 +279,17 @@ def test_the_equilibrium_of_mass_and_hand():
         return K_u * (12.0 - theta) - MASS * GRAVITY * lever
 
     assert found["theta"][-1] == pytest.approx(brentq(left, 1.0, 12.0), abs=1e-3)
+
+
+@pytest.mark.parametrize("hysteresis", ["bouc-wen", "dahl", "lugre"])
+def test_a_brake_that_holds_a_wound_load_lets_it_go_softly(hysteresis):
+    """No more than the mass's own weight pulls at the shaft, in either direction."""
+    model = actuator(hysteresis=hysteresis, load="pulley", turns=5.0)
+    blank = Dataset(np.zeros((16, 2)), np.full((16, len(model.outputs)), np.nan), 1.0 / 800.0)
+    omega = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal, blank)[0][
+        :, model.output_names.index("omega")
+    ]
+    values = dict(zip(model.parameter_names, model.nominal, strict=True))
+    weight = values["mass"] * 9.81 * values["radius"]
+    free = weight / (values["J_m"] + values["J_b"]) * 15.0 / 800.0
+    assert np.all(np.abs(omega) < free)
