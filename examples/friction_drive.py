@@ -8,7 +8,7 @@ and a sensor sees its position.
 from sysid import Input, Output, Parameter, ProcessModel, State
 
 FORCE_PER_VOLT = 35.0  # N/V
-STANDING = 1e-4  # m/s, below which dry friction holds the carriage
+STANDING = 1e-5  # m/s, below which dry friction holds the carriage
 
 
 def derivative(x, u, p):

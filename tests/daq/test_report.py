@@ -48,6 +48,7 @@ CONFIG = """
 model: gains.py:model
 population: 40
 generations: 8
+initial: {y: first}
 columns:
   time: {column: t}
   inputs: {u: {column: u}, w: {column: w}, still: {constant: 0}}
