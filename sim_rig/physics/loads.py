@@ -83,7 +83,9 @@ def pulley_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any, 
 def wound_up(model: ProcessModel, turns: float) -> dict[str, float]:
     """Where states of an actuator start whose brake holds a load that was wound up.
 
-    Raises ModelError for a load without a cable.
+    What the brake's friction holds depends on its parameters, and too much of it would push: it
+    starts without any, and takes the load within its first degrees. Raises ModelError for a load
+    without a cable.
     """
     values = dict(zip(model.parameter_names, model.nominal.tolist(), strict=True))
     if "k_cable" not in values:
@@ -91,8 +93,7 @@ def wound_up(model: ProcessModel, turns: float) -> dict[str, float]:
     theta = 2.0 * math.pi * turns
     length = values["radius"] * (math.hypot(theta, _CROSSOVER) - _CROSSOVER)
     height = length - values["mass"] * GRAVITY / values["k_cable"]
-    deflection = 1.0 / values.get("zeta", 1.0)  # LuGre's is an angle, of others a share
-    return {"theta": theta, "height": height, "z": -deflection}
+    return {"theta": theta, "height": height, "z": 0.0}
 
 
 def hand_torque(theta: Any, omega: Any, x: Any, u: Any, p: Any) -> tuple[Any]:
