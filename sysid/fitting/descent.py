@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.objective import FLOORS, Objective, Responses
+from sysid.fitting.objective import FLOORS, Objective
 from sysid.fitting.quadratic import FIRST_DAMPING, heavier
 from sysid.problem.space import SearchSpace
 
@@ -44,15 +44,6 @@ class Point:
     def accurate_rms(self) -> FloatArray | None:
         """The outputs' errors if their simulation had the integration steps that it needs."""
         return self.rms if self.excess <= 1.0 else None
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """A point and its neighbours, (1 + n_free, n_free), as simulated by steps per sample."""
-
-    coordinates: FloatArray
-    steps: tuple[int, ...]
-    responses: Responses
 
 
 @dataclass(frozen=True)
@@ -91,8 +82,7 @@ class Descent:
     iterations in a row that gained nothing, or hardly any of what was promised. level: of
     ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
     smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the
-    other side, because simulations fail on the usual one. surroundings: of the last iteration,
-    which after one that gained nothing often are those of the next.
+    other side, because simulations fail on the usual one.
     """
 
     point: Point
@@ -111,25 +101,17 @@ class Descent:
     backward: tuple[int, ...] = ()
     tolerance: float = TOLERANCE
     restriction: Restriction = FREE
-    surroundings: Surroundings | None = None
 
     @property
     def floor(self) -> float:
         """The floor below which outputs' errors are smoothed."""
         return FLOORS[self.smoothing] * self.point.error
 
-    def knows(self, coordinates: FloatArray) -> bool:
-        """Whether the responses at coordinates (n, n_free) are known by the present steps."""
-        around = self.surroundings
-        if around is None or around.steps != self.steps:
-            return False
-        return np.array_equal(around.coordinates, coordinates)
-
     def state(self) -> dict[str, Any]:
         """The state in plain values and arrays, of one that nothing restricts."""
         at, error = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
         state = vars(self) | vars(self.point) | {"sure": at, "sure_error": error}
-        del state["point"], state["safe"], state["restriction"], state["surroundings"]
+        del state["point"], state["safe"], state["restriction"]
         return state
 
     @classmethod

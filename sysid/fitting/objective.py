@@ -112,10 +112,6 @@ class Objective:
         """Count on from a number of simulations done before."""
         self._counter[0] = simulations
 
-    def count(self, simulations: int) -> None:
-        """Count simulations that need not be done, as their results are known."""
-        self._counter[0] += simulations
-
     def over(self, space: SearchSpace) -> Objective:
         """The same objective over another space of the same model; counts go on together."""
         return self._with(space=space)

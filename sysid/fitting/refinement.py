@@ -33,7 +33,6 @@ from sysid.fitting.descent import (
     Descent,
     Point,
     Restriction,
-    Surroundings,
     resumed,
 )
 from sysid.fitting.objective import FLOORS, Objective, Responses
@@ -166,8 +165,6 @@ def advance(objective: Objective, descents: Sequence[Descent]) -> list[Descent]:
     for first in range(0, len(live), per_batch):
         batch = slice(first, first + per_batch)
         iterated = _iterated(objective, ready[batch])
-        if per_batch < len(live):
-            iterated = [replace(descent, surroundings=None) for descent in iterated]
         for i, descent in zip(live[batch], iterated, strict=True):
             onward[i] = descent
     return onward
@@ -176,8 +173,8 @@ def advance(objective: Objective, descents: Sequence[Descent]) -> list[Descent]:
 def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents, whose integration steps are chosen, after one iteration."""
     space = objective.space
-    descents = _with_surroundings(objective, descents)
-    around = [descent.surroundings.responses for descent in descents if descent.surroundings]
+    neighbourhoods = [_neighbourhood(space, descent) for descent in descents]
+    around = _responses(objective, descents, neighbourhoods)
     surveys = [_surveyed(objective, *pair) for pair in zip(descents, around, strict=True)]
     onward = [descent for descent, _ in surveys]
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
@@ -213,22 +210,6 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     for i, offer in offers.items():
         onward[i] = _judged(objective, onward[i], offer, tried[i])
     return onward
-
-
-def _with_surroundings(objective: Objective, descents: list[Descent]) -> list[Descent]:
-    """The descents with their points and neighbours simulated, if they are not already.
-
-    All count as simulations: a descent that is resumed knows none, and budgets are to last alike.
-    """
-    rows = [_neighbourhood(objective.space, descent) for descent in descents]
-    lacking = [i for i, descent in enumerate(descents) if not descent.knows(rows[i])]
-    objective.count(sum(map(len, rows)) - sum(len(rows[i]) for i in lacking))
-    anew = _responses(objective, [descents[i] for i in lacking], [rows[i] for i in lacking])
-    ready = list(descents)
-    for i, responses in zip(lacking, anew, strict=True):
-        surroundings = Surroundings(rows[i], descents[i].steps, responses)
-        ready[i] = replace(descents[i], surroundings=surroundings)
-    return ready
 
 
 def _surveyed(
@@ -281,7 +262,7 @@ def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Res
         point = Point(at, error, ends.rms[best], float(ends.excess[best]))
         far = np.any(np.abs(at - descent.steps_at) > _FAR * objective.space.width)
         steps_at = None if far else descent.steps_at
-        descent = replace(descent, point=point, steps_at=steps_at, gain=gain, surroundings=None)
+        descent = replace(descent, point=point, steps_at=steps_at, gain=gain)
     promising = offer.promise > NOTHING
     failed = gain <= 0.0 or (promising and gain < _KEPT * offer.promise)
     failures = descent.failures + 1 if failed else 0

@@ -165,7 +165,7 @@ class Tracer:
         quantity: Profiled,
     ) -> None:
         self.quantity, self.start = quantity, local.objective.space.encode(local.chromosome)
-        objective = self.objective = local.around(self.start)
+        self._local, self._near, objective = local, self.start, local.criterion
         self.centre = quantity.at(self.start)
         self.error = local.error
         deviation = covariance.deviation(gradient)
@@ -255,10 +255,15 @@ class Tracer:
         share = 0.5 if halve else _share(inside, outside)
         return inside.place + share * (outside.place - inside.place)
 
-    def beside(self, local: Sensitivity, fit: Fit) -> Self:
+    @property
+    def objective(self) -> Objective:
+        """What is fitted, for places around the estimate or, of ``beside``, a fit."""
+        return self._local.around(self._near)
+
+    def beside(self, fit: Fit) -> Self:
         """The same for places around a fit, perhaps far from the estimate."""
         tracer = copy.copy(self)
-        tracer.objective = local.around(fit.at)
+        tracer._near = fit.at
         return tracer
 
     def statistic(self, error: float) -> float:

@@ -171,9 +171,9 @@ def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
     rig("run", "levels.yaml", "--rig", "rig.yaml", cwd=tmp_path)
     (log,) = tmp_path.glob("runs/*/log.csv")
     table = np.genfromtxt(log, delimiter=",", names=True)
-    assert simulated.inputs[40:, 2] == pytest.approx(
-        table["torque"][40:400], abs=2e-3
-    )  # of noise of 7e-3
+    # The rig's brake has held the load; here it takes it first, and the mass rings on its cable.
+    assert simulated.inputs[40:, 2] == pytest.approx(table["torque"][40:400], abs=2e-3)
+    assert simulated.inputs[100:, 2] == pytest.approx(table["torque"][100:400], abs=1e-3)
 
 
 @pytest.mark.soak

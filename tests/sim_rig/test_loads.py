@@ -290,6 +290,6 @@ def test_a_brake_that_holds_a_wound_load_lets_it_go_softly(hysteresis):
         :, model.output_names.index("omega")
     ]
     values = dict(zip(model.parameter_names, model.nominal, strict=True))
-    weight = values["mass"] * 9.81 * values["radius"]
+    weight = values["mass"] * GRAVITY * values["radius"]
     free = weight / (values["J_m"] + values["J_b"]) * 15.0 / 800.0
     assert np.all(np.abs(omega) < free)

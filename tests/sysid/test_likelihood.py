@@ -246,30 +246,31 @@ def test_a_measured_one_tells_them_apart():
     assert second.low < 0.12 < second.high
 
 
-def formula_objective(formula, low, high):
-    """The objective of y = formula(a, b) u0, a and b searched linearly, and noise."""
+BOTH = {"a": 2.0, "b": 2.0}
+
+
+def formula_objective(formula, truth, low, high, seed=0):
+    """The objective of y = formula(p, u), its parameters searched linearly, and noise."""
     model = ProcessModel(
         name="formula",
         states=(State("x", "1"),),
         inputs=(Input("u0", "1"), Input("u1", "1")),
         outputs=(Output("x", "1"),),
-        parameters=tuple(
-            Parameter(name, "1", 2.0, low, high, minimum=-np.inf) for name in ("a", "b")
-        ),
+        parameters=tuple(Parameter(name, "1", 2.0, low, high, minimum=-np.inf) for name in truth),
         derivative=twice_derivative,
     )
 
     def outputs(p, u):
-        return (formula(p["a"], p["b"]) * u[:, 0])[:, None]
+        return formula(p, u)[:, None]
 
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     u = rng.standard_normal((300, 2))
-    y = outputs({"a": 2.0, "b": 2.0}, u) + 0.1 * rng.standard_normal((300, 1))
+    y = outputs(truth, u) + 0.1 * rng.standard_normal((300, 1))
     return Objective(Formula(model, outputs), SearchSpace.of(model), [Dataset(u, y, 0.01)])
 
 
 def test_a_curved_valley_is_one_answer_and_its_hull_the_interval():
-    target = formula_objective(lambda a, b: a * b, 0.5, 10.0)
+    target = formula_objective(lambda p, u: p["a"] * p["b"] * u[:, 0], BOTH, 0.5, 10.0)
     ends = [np.array([1.0, 4.0]), np.array([4.0, 1.0])]
     result = fit_likelihood(target, ends)
     assert result.rivals == () and len(result.ridge) == 1
@@ -280,29 +281,14 @@ def test_a_curved_valley_is_one_answer_and_its_hull_the_interval():
         assert (estimate.high or 10.0) >= max(end[j] for end in ends) - 0.1
 
 
-def bent_objective(seed):
-    """y = (q(a) u0 + c a u1) and noise: q is alike on both sides of a low wall, c hardly felt."""
-    model = ProcessModel(
-        name="formula",
-        states=(State("x", "1"),),
-        inputs=(Input("u0", "1"), Input("u1", "1")),
-        outputs=(Output("x", "1"),),
-        parameters=(Parameter("a", "1", 2.0, -5.0, 10.0, minimum=-np.inf),),
-        derivative=twice_derivative,
-    )
-
-    def outputs(p, u):
-        return (0.018 * ((p["a"] - 2.0) ** 2 - 1.0) * u[:, 0] + 0.0058 * p["a"] * u[:, 1])[:, None]
-
-    rng = np.random.default_rng(seed)
-    u = rng.standard_normal((300, 2))
-    y = outputs({"a": 3.0}, u) + 0.1 * rng.standard_normal((300, 1))
-    return Objective(Formula(model, outputs), SearchSpace.of(model), [Dataset(u, y, 0.01)])
+def bent(p, u):
+    """Alike on both sides of a low wall but for what is hardly felt."""
+    return 0.018 * ((p["a"] - 2.0) ** 2 - 1.0) * u[:, 0] + 0.0058 * p["a"] * u[:, 1]
 
 
 @pytest.mark.parametrize("seed", [21, 28])  # of whose bottoms one is 6.5 and 3.9 behind
 def test_every_bottom_of_a_valley_has_its_own_interval_within_the_whole(seed):
-    target = bent_objective(seed)
+    target = formula_objective(bent, {"a": 3.0}, -5.0, 10.0, seed)
     result = fit_likelihood(target, [np.array([3.0]), np.array([1.0])])
     assert result.rivals == () and len(result.ridge) == 1
     best, (behind,) = result.optimum.chromosome, result.ridge
@@ -318,7 +304,7 @@ def test_every_bottom_of_a_valley_has_its_own_interval_within_the_whole(seed):
 
 
 def test_minima_with_a_wall_between_them_are_rivals_each_with_an_interval():
-    target = formula_objective(lambda a, b: a * a, -5.0, 5.0)
+    target = formula_objective(lambda p, u: p["a"] ** 2 * u[:, 0], BOTH, -5.0, 5.0)
     result = fit_likelihood(target, [np.array([2.0, 1.0]), np.array([-2.0, 1.0])])
     assert len(result.rivals) == 1 and result.ridge == ()
     intervals = uncertainty(result.optimum.objective, result.optimum.chromosome, result.rivals)
