@@ -30,6 +30,7 @@ from sysid.gassi.slide import slid
 from sysid.uncertainty.colour import colour, longest_memory
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
+from sysid.uncertainty.ties import Shown, ties
 
 _ROUNDS = 6  # of weights and parameters in turn
 _NOISE_ROUNDS = 20  # the same of noise, weights and parameters
@@ -197,10 +198,12 @@ class _Optima:
             self._optima.append(optimum)
 
     def new(self, chromosome: FloatArray, others: Sequence[FloatArray] = ()) -> bool:
-        """Whether a chromosome is far from all minima, and others, where the data feel it."""
-        coded = self._objective.space.encode
+        """Whether a chromosome is far from all minima, and others, where the data feel it.
+
+        Along ties it is no other minimum, however far.
+        """
         for minimum in (*_chromosomes(self._optima), *others):
-            moved = coded(minimum) - coded(chromosome)
+            moved = self._shown.move(minimum, chromosome)
             if moved @ self._information @ moved < _ONE:
                 return False
         return True
@@ -293,6 +296,11 @@ class _Optima:
         inverse = np.linalg.inv(information / most + _SLACK * np.eye(len(width)))
         deviations: FloatArray = np.sqrt(np.maximum(np.diag(inverse), 1.0)) * width
         return deviations
+
+    @cached_property
+    def _shown(self) -> Shown:
+        first = self._sensitivity
+        return Shown(ties(first), self._objective.space, first.chromosome)
 
     @cached_property
     def _sensitivity(self) -> Sensitivity:

@@ -24,7 +24,7 @@ from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.profile import Fit, Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
-from sysid.uncertainty.ties import Ties, free_gradient, named_values, ties
+from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
 
 # Standard deviation of a logarithm above which the slopes at the estimate are no guide.
 _WEAK = 0.2
@@ -343,9 +343,7 @@ class _Analysis:
                 place = self.space.names.index(name)
                 changes.append(point[place] - self.coded[place])
                 continue
-            value, here = combination.value(there), combination.value(self.named)
-            positive = min(value, here) > 0.0
-            changes.append(here * np.log(value / here) if positive else value - here)
+            changes.append(change(combination, self.named, there))
         return np.array(changes)
 
     def parameter(self, j: int) -> _Draft:

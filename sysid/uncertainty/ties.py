@@ -66,6 +66,49 @@ class Ties:
         return [(sorted(members), self.directions[rows]) for members, rows in groups]
 
 
+class Shown:
+    """How far chromosomes are apart in what outputs show: of the tied in their combinations.
+
+    Where not all combinations have a name it is in all coordinates.
+
+    >>> from sysid.examples import lag
+    >>> space = SearchSpace.of(lag())
+    >>> chromosome = np.array([1.0, 0.5])
+    >>> Shown(Ties(np.zeros((0, 2))), space, chromosome).move(chromosome, 2.0 * chromosome).round(3)
+    array([0.693, 0.693])
+    """
+
+    def __init__(self, ties: Ties, space: SearchSpace, chromosome: FloatArray) -> None:
+        self._space, self._here = space, named_values(space, chromosome)
+        increments = np.where(space.log, chromosome, 1.0)
+        alone, self._combinations = ~np.array(ties.bound, dtype=bool), ties.combinations
+        gradients = [free_gradient(c, space, self._here) * increments for c in self._combinations]
+        rows = np.concatenate([np.eye(len(alone))[alone], *map(np.atleast_2d, gradients)])
+        self._alone, self._sizes = alone, np.linalg.norm(rows, axis=1)
+        rows /= self._sizes[:, None]
+        if np.linalg.matrix_rank(rows) + len(ties.directions) < len(alone):
+            self._alone, self._combinations = np.ones_like(alone), ()
+            rows, self._sizes = np.eye(len(alone)), np.ones(len(alone))
+        self._back = np.linalg.pinv(rows)
+
+    def move(self, start: FloatArray, end: FloatArray) -> FloatArray:
+        """The least move of the search coordinates, (n_free,), that shows as much."""
+        move: FloatArray = self._back @ ((self._of(end) - self._of(start)) / self._sizes)
+        return move
+
+    def _of(self, chromosome: FloatArray) -> FloatArray:
+        there = named_values(self._space, chromosome)
+        combined = [change(c, self._here, there) for c in self._combinations]
+        return np.array([*self._space.encode(chromosome)[self._alone], *combined])
+
+
+def change(combination: Invariant, here: Mapping[str, float], there: Mapping[str, float]) -> float:
+    """Change of a combination between parameters by name, of a positive one as of its logarithm."""
+    before, after = combination.value(here), combination.value(there)
+    positive = min(before, after) > 0.0
+    return float(before * np.log(after / before) if positive else after - before)
+
+
 def ties(sensitivity: Sensitivity) -> Ties:
     """What the model's equations leave undetermined; nothing if they cannot be followed."""
     objective = sensitivity.objective

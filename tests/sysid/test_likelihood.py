@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -346,6 +347,22 @@ PRODUCT_LAG = ProcessModel(
     ),
     derivative=product_lag_derivative,
 )
+
+
+def sum_lag_derivative(x, u, p):
+    a, b = p
+    return ((u[0] - x[0]) / (a + b),)
+
+
+def test_along_a_tie_there_is_no_minimum_but_one():
+    """However far: of the sum of two time constants both are known to a hundredth."""
+    parameters = tuple(Parameter(name, "s", 0.1, 0.001, 1.0, "log") for name in ("a", "b"))
+    model = replace(PRODUCT_LAG, parameters=parameters, derivative=sum_lag_derivative)
+    target = objective_of(model, record_of(model, 0.01, noise=0.02))
+    ends = [refine(target, np.array(start)).chromosome for start in ([0.19, 0.01], [0.02, 0.18])]
+    assert abs(ends[0][0] - ends[1][0]) > 0.1
+    result = fit_likelihood(target, ends)
+    assert result.rivals == () and result.ridge == ()
 
 
 @pytest.mark.soak
