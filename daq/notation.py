@@ -96,6 +96,8 @@ def number(value: float, digits: int = 4) -> str:
         places = digits - 1 - exponent
         return f"{round(value, places):.{max(places, 0)}f}"
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    if int(power) > exponent:  # 9.96e-5 is 1.00e-4, as 0.0996 is 0.100: its last place stays
+        mantissa += "0" if digits > 1 else ".0"
     return f"{mantissa}e{int(power)}"
 
 

@@ -26,9 +26,9 @@ _MOST_TRENDS = 12  # parameters that are drawn where none are named
 
 def require_quantities(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
     """Raise ConfigError for a parameter or combination that no run has."""
-    present = dict.fromkeys(row.name for entry in entries for row in entry.quantities)
     for name in names:
-        if name not in present:
+        if not any(name in entry.values for entry in entries):
+            present = dict.fromkeys(quantity for entry in entries for quantity in entry.values)
             cure = suggestion(name, list(present))
             raise ConfigError(f"no run has {name!r}", cure=cure, key="--parameters")
 

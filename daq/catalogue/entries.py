@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from daq.config import json_file, yaml_file
 from daq.errors import RigError
@@ -27,8 +27,9 @@ class RunEntry:
     """A run: where it is, what it was, what is noted of it, what was identified from it.
 
     folder: below the catalogue's, with ``/`` between names. started: ISO 8601 in UTC. trust: the
-    verdict's word, then of predictions and of parameters. quantities: identified parameters and
-    combinations. problems: what of its files could not be read, and why.
+    verdict's word, then of predictions and of parameters. rows: the fields of ``quantities`` as
+    JSON, read when they are asked for: ten thousand runs have a quarter of a million of them.
+    problems: what of its files could not be read, and why.
     """
 
     folder: str
@@ -43,34 +44,44 @@ class RunEntry:
     predictions: str = ""
     parameters: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
-    quantities: tuple[QuantityRow, ...] = ()
+    rows: str = "[]"
     problems: tuple[str, ...] = ()
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Identified parameters and combinations by name."""
+        return {name: value for name, value, *_ in json.loads(self.rows)}
 
     @cached_property
     def facts(self) -> dict[str, Any]:
         """Everything that can be asked for, by key: its own, metadata, values of quantities."""
-        values = {row.name: row.value for row in self.quantities}
-        texts = {key: value for key, value in vars(self).items() if key not in _GROUPS}
-        return {**values, **self.metadata, **texts}
+        texts = {key: getattr(self, key) for key in _TEXTS}
+        return {**self.values, **self.metadata, **texts}
+
+    def fact(self, key: str) -> Any:
+        """One of the facts; None where it is not known."""
+        if key in _TEXTS:
+            return getattr(self, key)
+        return self.metadata[key] if key in self.metadata else self.values.get(key)
+
+    @cached_property
+    def quantities(self) -> tuple[QuantityRow, ...]:
+        """Identified parameters and combinations."""
+        return tuple(map(_quantity, json.loads(self.rows)))
 
     @property
     def document(self) -> dict[str, Any]:
         """The same for machines."""
-        return asdict(self)
-
-    @classmethod
-    def of(cls, document: Mapping[str, Any]) -> Self:
-        """From its document."""
-        quantities = tuple(_quantity(entry) for entry in document["quantities"])
-        problems = tuple(document["problems"])
-        return cls(**{**document, "quantities": quantities, "problems": problems})
+        document = asdict(self)
+        del document["rows"]
+        return {**document, "quantities": [asdict(row) for row in self.quantities]}
 
     def quantity(self, name: str) -> QuantityRow | None:
         """An identified parameter or combination; None where it has none of that name."""
         return next((row for row in self.quantities if row.name == name), None)
 
 
-_GROUPS = ("metadata", "quantities", "problems")
+_TEXTS = [f.name for f in fields(RunEntry) if f.name not in ("metadata", "rows", "problems")]
 
 
 def captures(root: Path) -> Iterator[tuple[str, str]]:
@@ -154,32 +165,34 @@ def _identified(folder: Path) -> dict[str, Any]:
         name: verdict[name]["trust"] for name in ("predictions", "parameters") if name in verdict
     }
     searched = [row for row in rows.parameters if isinstance(row, ParameterRow) and row.free]
-    quantities = tuple(_plain(row) for row in (*searched, *rows.combinations))
     return {
         "model": str(document["model"]),
         "trust": str(verdict["trust"]),
         **statements,
-        "quantities": quantities,
+        "rows": json.dumps([_plain(row) for row in (*searched, *rows.combinations)]),
     }
 
 
-def _plain(row: QuantityRow) -> QuantityRow:
-    """A row without what only a table of parameters shows."""
-    return QuantityRow(
-        row.name, row.value, row.unit, row.interval, row.std, row.undetermined, row.here, row.fails
-    )
+def _plain(row: QuantityRow) -> tuple[Any, ...]:
+    """The fields of a row, without those that only a table of parameters shows."""
+    return tuple(getattr(row, name) for name in _FIELDS)
 
 
-def _quantity(entry: Mapping[str, Any]) -> QuantityRow:
-    ends = {key: None if entry[key] is None else tuple(entry[key]) for key in ("interval", "here")}
-    return QuantityRow(**{**entry, **ends})
+_FIELDS = [f.name for f in fields(QuantityRow)]
+
+
+def _quantity(row: Sequence[Any]) -> QuantityRow:
+    values: list[Any] = [tuple(value) if isinstance(value, list) else value for value in row]
+    return QuantityRow(*values)
 
 
 def to_text(entry: RunEntry) -> str:
     """An entry as one line of JSON."""
-    return json.dumps(entry.document, separators=(",", ":"))
+    stored = {f.name: getattr(entry, f.name) for f in fields(entry)}
+    return json.dumps(stored, separators=(",", ":"))
 
 
 def from_text(text: str) -> RunEntry:
     """An entry from its line. Raises ValueError, TypeError or KeyError for what is none."""
-    return RunEntry.of(json.loads(text))
+    document = json.loads(text)
+    return RunEntry(**{**document, "problems": tuple(document["problems"])})

@@ -34,7 +34,7 @@ class Condition:
 
     def holds(self, entry: RunEntry) -> bool:
         """Whether it does for a run; never for one of which the key is not known."""
-        fact = entry.facts.get(self.key)
+        fact = entry.fact(self.key)
         if fact is None or fact == "":
             return self.operator == "!=" and self.value != ""
         facts = fact if isinstance(fact, list | tuple) else [fact]
@@ -91,11 +91,11 @@ def select(root: Path, entries: Sequence[RunEntry], terms: Iterable[str]) -> lis
 def ordered(entries: Sequence[RunEntry], key: str) -> list[RunEntry]:
     """Runs by a fact, those without it first. Raises ConfigError for a key that none has."""
     key = _require_key(entries, key, "--sort")
-    facts = [entry.facts.get(key) for entry in entries]
+    facts = [entry.fact(key) for entry in entries]
     numbers = all(isinstance(fact, int | float) for fact in facts if fact is not None)
 
     def place(entry: RunEntry) -> tuple[bool, Any]:
-        fact = entry.facts.get(key)
+        fact = entry.fact(key)
         if fact is None:
             return False, 0.0 if numbers else ""
         return True, fact if numbers else str(fact).casefold()
@@ -134,7 +134,7 @@ def _folder(root: Path, term: str) -> str | None:
 
 def _checked(entries: Sequence[RunEntry], condition: Condition) -> Condition:
     """A condition that can be asked; ConfigError where an order wants a number or a date."""
-    facts = [entry.facts[condition.key] for entry in entries if condition.key in entry.facts]
+    facts = [entry.fact(condition.key) for entry in entries]
     numbers = any(isinstance(fact, int | float) for fact in facts)
     if numbers and condition.operator in _ORDERS:
         try:
@@ -151,14 +151,13 @@ def _checked(entries: Sequence[RunEntry], condition: Condition) -> Condition:
 
 def _require_key(entries: Sequence[RunEntry], key: str, place: str) -> str:
     key = _SINGULAR.get(key, key)
-    keys = list(dict.fromkeys(k for entry in entries for k in entry.facts))
-    if entries and key not in keys:
+    if entries and all(entry.fact(key) is None for entry in entries):
+        keys = list(dict.fromkeys(k for entry in entries for k in entry.facts))
         raise ConfigError(f"no run has {key!r}", cure=suggestion(key, keys), key=place)
     return key
 
 
 def _texts(entry: RunEntry) -> list[str]:
-    names = [row.name for row in entry.quantities]
-    facts = [fact for key, fact in entry.facts.items() if key not in names]
+    facts = [fact for key, fact in entry.facts.items() if key not in entry.values]
     parts = [part for fact in facts for part in (fact if isinstance(fact, list) else [fact])]
     return [str(part).casefold() for part in parts]

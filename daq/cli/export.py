@@ -25,25 +25,28 @@ Target = Annotated[
 
 
 def export_mat(log: Log, out: Target = None, json: options.AsJson = False) -> None:
-    """Write a log as a MAT file (level 5), for MATLAB, Octave and scipy.
+    """Write a log as a MAT file, for MATLAB, Octave and scipy.
 
-    A vector for each column, their units, and the record of the run. rig identify reads it too.
+    Level 5: a vector for each column, their units, and the record of the run. rig identify reads it
+    too.
     """
     _export_log(log, out, "mat", json)
 
 
 def export_mcap(log: Log, out: Target = None, json: options.AsJson = False) -> None:
-    """Write a log as MCAP, for Foxglove and PlotJuggler; needs hybrid-rig[formats].
+    """Write a log as MCAP, for Foxglove and PlotJuggler.
 
-    A message a sample on /samples at its time of day, the record of the run attached.
+    A message a sample on /samples at its time of day, the record of the run attached. Needs
+    hybrid-rig[formats].
     """
     _export_log(log, out, "mcap", json)
 
 
 def export_parquet(log: Log, out: Target = None, json: options.AsJson = False) -> None:
-    """Write a log as a Parquet table, for pandas, Polars and DuckDB; needs hybrid-rig[formats].
+    """Write a log as Parquet, for pandas, Polars and DuckDB.
 
-    Units are metadata of the columns, the record of the run that of the table.
+    Units are metadata of the columns, the record of the run that of the table. Needs
+    hybrid-rig[formats].
     """
     _export_log(log, out, "parquet", json)
 
@@ -73,10 +76,11 @@ def export_fmu(
     trust: options.Trust = False,
     json: options.AsJson = False,
 ) -> None:
-    """Write an identified model as a functional mock-up unit (FMI 3.0, co-simulation).
+    """Write an identified model as an FMU, for other simulators.
 
-    Its C source is inside, and on Linux with a compiler (cc) what that compiles to; whoever
-    simulates it needs no Python. Parameters and starts can be set, inputs are held over a step.
+    FMI 3.0, co-simulation. Its C source is inside, and on Linux with a compiler (cc) what that
+    compiles to; whoever simulates it needs no Python. Parameters and starts can be set, inputs are
+    held over a step.
     """
     from daq.fmu.export import export
     from daq.identification.request import result_file
@@ -102,9 +106,10 @@ def export_c(
     out: Annotated[Path, Option(metavar="FOLDER", help="Where NAME.h and NAME.c go.")] = Path(),
     json: options.AsJson = False,
 ) -> None:
-    """Write a torque controller, and its actuator's model, as C99 for a device's firmware.
+    """Write a torque controller as C99, for a firmware.
 
-    Fixed memory, no library beyond math.h; NAME is the controller's file's.
+    The model of its actuator is with it. Fixed memory, no library beyond math.h; NAME is the
+    controller's file's.
     """
     from daq.device_code import device_code
 

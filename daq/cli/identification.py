@@ -201,6 +201,10 @@ def _show_products(rows: Rows) -> None:
             interval = row.span(scale)
             ends = f"95 % interval {interval}" if row.interval else row.undetermined_label
             terminal.print_text(f"    {row.name} = {quantity}, {ends}")
+        for name in ambiguity.parameters:
+            state, _, log = name.partition("(0) ")
+            if log == "1":  # of several, which are numbered alike
+                terminal.print_text(f"    {name} is where {state} starts in the first log.")
         starts = [name for name in ambiguity.measure if "(0)" in name]
         measure = " and ".join(name for name in ambiguity.measure if name not in starts)
         if measure:
@@ -273,7 +277,7 @@ def _show_notes(result: Identification) -> None:
         )
     if rows.refined:
         criterion = result.document["criterion"]
-        terminal.print_text(f"Criterion: {criterion['name']}, {criterion['reason']}.")
+        terminal.print_text(f"Criterion: {criterion['name']} ({criterion['reason']}).")
     if excerpt := result.document["search"].get("excerpt"):
         share = f"{excerpt['samples']} of {excerpt['of']} samples"
         terminal.print_text(

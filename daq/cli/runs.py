@@ -62,6 +62,7 @@ def runs(
     from daq.catalogue.comparison import draw_comparison, quantities_of, require_quantities
     from daq.catalogue.index import catalogue
     from daq.catalogue.query import ordered, select
+    from daq.errors import ConfigError
 
     names = [name.strip() for name in (parameters or "").split(",") if name.strip()]
     with terminal.watching(json) as watch:
@@ -71,6 +72,9 @@ def runs(
         if note or tag or untag:
             if not terms:
                 raise BadParameter("say of which runs; name them, or a word that they have")
+            if not chosen:
+                cure = "rig runs lists them all"
+                raise ConfigError("no run is meant, and nothing was noted", cure=cure)
             chosen = annotate(folder, chosen, note or [], tag or [], untag or [])
         if plot is not None and chosen:
             draw_comparison(folder, chosen, names, plot, watch)

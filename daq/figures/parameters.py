@@ -49,19 +49,21 @@ def ranges(names: Sequence[str], places: FloatArray, notes: Sequence[str]) -> Fi
     labels, left = style.row_names(names)
     figure, (panel,) = style.stack([0.155 * len(names) + 0.1], left=left, top=0.24, right=0.95)
     bar: dict[str, Any] = {"lw": 3.0, "solid_capstyle": "butt"}
+    determined = [bool(np.isfinite(ends).all()) for ends in places[:, 1:]]
     for row, (value, *ends) in enumerate(places.tolist()):
         panel.plot([0.0, 1.0], [row, row], color=style.FAINT, zorder=1, **bar)
-        determined = np.isfinite(ends).all()
-        if determined:
+        if determined[row]:
             panel.plot(ends, [row, row], color=style.BASELINE, zorder=2, **bar)
         panel.plot(value, row, "o", ms=3.2, zorder=3, mec=style.IDENTIFIED, mew=0.8,
-                   mfc=style.IDENTIFIED if determined else "white")  # fmt: skip
+                   mfc=style.IDENTIFIED if determined[row] else "white")  # fmt: skip
         if notes[row]:
             panel.text(1.07, row, notes[row], va="center", fontsize=6.0)
     panel.plot([], [], color=style.FAINT, lw=3.0, label="range")
-    panel.plot([], [], color=style.BASELINE, lw=3.0, label="95 % interval")
-    panel.plot([], [], "o", ms=3.2, mfc=style.IDENTIFIED, mec=style.IDENTIFIED, label="value")
-    panel.plot([], [], "o", ms=3.2, mfc="white", mec=style.IDENTIFIED, label="no interval")
+    if any(determined):
+        panel.plot([], [], color=style.BASELINE, lw=3.0, label="95 % interval")
+        panel.plot([], [], "o", ms=3.2, mfc=style.IDENTIFIED, mec=style.IDENTIFIED, label="value")
+    if not all(determined):
+        panel.plot([], [], "o", ms=3.2, mfc="white", mec=style.IDENTIFIED, label="no interval")
     style.legend(figure, panel, left=0.2)
     _name_rows(panel, labels)
     panel.set_xlim(-0.04, 1.04)

@@ -44,7 +44,7 @@ class SettingsRequest:
     @property
     def config_words(self) -> list[str]:
         """Words that name its file again; none without one."""
-        return [] if self.config is None else ["--config", _from_here(self.config)]
+        return [] if self.config is None else ["--config", from_here(self.config)]
 
     def words(self, settings: Sequence[str] = (), **options: Any) -> list[str]:
         """Words of ``rig identify`` behind its logs that ask for the same, but for what is given.
@@ -57,9 +57,9 @@ class SettingsRequest:
         whole = {**self.options, **options}
         for name, value in sorted(whole.items(), key=lambda option: option[0] != "model"):
             for each in value if isinstance(value, list | tuple) else [value]:
-                if each is not None:
+                if each is not None and each is not False:
                     words.append(f"--{name.replace('_', '-')}")
-                    words += [] if each is True else [_from_here(str(each))]
+                    words += [] if each is True else [from_here(str(each))]
         replaced = {setting.partition("=")[0] for setting in settings}
         kept = [s for s in self.settings if s.partition("=")[0] not in replaced]
         return [*words, *(word for setting in (*kept, *settings) for word in ("--set", setting))]
@@ -113,6 +113,11 @@ def set_options(settings: Sequence[str]) -> str:
     return "".join(f" --set {shlex.quote(setting)}" for setting in settings)
 
 
+def from_here(name: str) -> str:
+    """An absolute name as one would type it, where it is in the working folder or below."""
+    return name.removeprefix(f"{Path.cwd()}{os.sep}")
+
+
 def forget(folder: Path) -> None:
     """Remove what is needed only to continue."""
     for name in (CHECKPOINT, FILE):
@@ -135,11 +140,6 @@ def result_file(result: str | Path) -> Path:
             return place / PARAMETERS
     cure = f"identify first: rig identify {shlex.quote(str(given))}"
     raise ConfigError(f"no identification has written a {PARAMETERS} there", cure=cure, file=given)
-
-
-def _from_here(name: str) -> str:
-    """An absolute name as one would type it, where it is in the working folder or below."""
-    return name.removeprefix(f"{Path.cwd()}{os.sep}")
 
 
 def _absolute(paths: Sequence[Path | str]) -> list[str]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from daq.identification.request import set_options
+from daq.identification.request import from_here, set_options
 from daq.identification.rows import OutputErrors, Rows, logs_of, mean_errors, start_sentences
 from daq.lookup.models import trust_option
 from sysid import ProcessModel
@@ -54,6 +54,7 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
         "rival": next(iter(rows.ambiguities_of("rival")), None),
         # States that a combination holds the start of.
         "starts": {name: f"{name}(0)" for name in model.state_names if f"{name}(0)" in names},
+        "several_logs": len(rows.logs["training"]) > 1,
         "start_sentences": start_sentences(document["metrics"]["validation"]),
         "steps": _steps(document, rows),
         "ended": _ENDED[search["stopped"]],
@@ -188,7 +189,7 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
         )
         columns, parameters = again["columns"], again.get("parameters", "parameters.yaml")
         command = f"rig replay LOG --parameters {shlex.quote(parameters)}"
-        command += f" --config {shlex.quote(columns)}" if columns else ""
+        command += f" --config {shlex.quote(from_here(columns))}" if columns else ""
         command += set_options(again["settings"])
         steps.insert(0, Step(use, command=command + trust_option(document["model"])))
     elif not steps:

@@ -216,10 +216,12 @@ def _search(document: Mapping[str, Any]) -> Iterator[Picture]:
 
 def _parameters(rows: Rows) -> Iterator[Picture]:
     if rows.free:
+        open_circles = (
+            " Open circles have no interval: the data do not determine these by themselves."
+        ) * any(row.interval is None for row in rows.free)
         yield Picture(
             "ranges", "parameters",
-            "Every free parameter in the range that it was searched in. Open circles have no "
-            "interval: the data do not determine these by themselves.",
+            f"Every free parameter in the range that it was searched in.{open_circles}",
             ranges(
                 [row.name for row in rows.free],
                 np.array([_scaled_to_range(row) for row in rows.free]),
@@ -279,12 +281,19 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
     except ModelError:
         return  # too short, or of several sample rates: there is no estimate to show
     inputs = subject.model.inputs
-    varied = np.flatnonzero(measured.varied)
+    varied, pairs = np.flatnonzero(measured.varied), _pairs(measured)
+    unexplained = [
+        output.name for j, output in enumerate(subject.model.outputs) if j not in dict(pairs)
+    ]
+    missing = (
+        f" No frequency response of {', '.join(unexplained)} is drawn: an input explains it (with "
+        f"a coherence above {_COHERENT}) at fewer than {_FEWEST_COHERENT} of these frequencies."
+    ) * bool(unexplained)
     densities = {inputs[i].name: measured.input_density[:, i] for i in varied}
     yield Picture(
         "spectra", "excitation",
         "Spectra of the excitation: power spectral density of the inputs, Welch's estimate from "
-        f"{measured.n_segments} segments.",
+        f"{measured.n_segments} segments.{missing}",
         spectra(measured.frequency, densities, {signal.name: signal.unit for signal in inputs}),
     )  # fmt: skip
     identified = _estimated_response(subject)
@@ -292,7 +301,7 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         np.geomspace(measured.frequency[0], measured.frequency[-1], _FINE), measured.frequency
     )
     linear, lacking = _linear_responses(subject, band)
-    for j, i in _pairs(measured):
+    for j, i in pairs:
         output, given = subject.model.outputs[j], inputs[i]
         yield Picture(
             _stem("bode", output.name), "frequency",

@@ -115,12 +115,9 @@ def command_of(
     """What to type to identify the same again; more: words behind the options."""
     training, validation = map(_paths, logs)
     words = ["rig", "identify", *map(str, training)]
-    words += _option("validate", [path for path in validation if path not in training])
-    words += _option("config", request.config) + _option("model", list(models))
-    for name, value in request.options.items():
-        if name not in ("seed", "model"):
-            words += _option(name, value)
-    return shlex.join([*words, *more, *_option("set", list(request.settings))])
+    for path in validation:
+        words += [] if path in training else ["--validate", str(path)]
+    return shlex.join([*words, *request.words(model=list(models), seed=None), *more])
 
 
 def fingerprints(logs: Split) -> list[dict[str, Any]]:
@@ -213,16 +210,6 @@ def _reproduction(result: Identification, logs: Split) -> dict[str, Any]:
 def _paths(logs: Sequence[LoggedRecord]) -> list[Path]:
     """Their files, each once: a log of which a part is held back stands for two."""
     return list(dict.fromkeys(log.path for log in logs))
-
-
-def _option(name: str, value: Any) -> list[str]:
-    flag = f"--{name.replace('_', '-')}"
-    if value is None or value is False:
-        return []
-    if value is True:
-        return [flag]
-    values = value if isinstance(value, list | tuple) else [value]
-    return [word for item in values for word in (flag, str(item))]
 
 
 def _run(record: Mapping[str, Any]) -> dict[str, Any]:

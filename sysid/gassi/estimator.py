@@ -545,8 +545,9 @@ class GASSI(RecordEstimator):
         if self.criterion != "auto":
             return self.criterion, "as set"
         timed = any(record.windows.size for record in records)
-        remark = "; over which times the outputs were averaged is known" if timed else ""
-        reason = f"{names} is measured with noise, which a free run passes on{remark}"
+        reason = f"{names} is measured with noise, which a free run passes on to the outputs"
+        if timed:
+            reason += ", and it is known over which times they were averaged"
         return "innovations" if timed else "compensated", reason
 
     def _check_filter(self, noisy: tuple[int, ...]) -> None:

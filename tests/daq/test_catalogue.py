@@ -139,6 +139,7 @@ def test_of_several_folders_any_is_meant(lab):
         (("--parameters", "gian"), "did you mean 'gain'?"),
         (("--in", "nowhere"), "record a run"),
         (("--tag", "x"), "say of which runs"),
+        (("nobody", "--tag", "x"), "no run is meant, and nothing was noted"),
         (("ann", "--tag", " "), "is no tag"),
         (("ann", "--note", "tags=" + "x" * 90), "at most 80 letters"),
         (("--plot", "runs.bmp"), "figures are written as svg, pdf, png"),

@@ -140,6 +140,15 @@ def test_legends_touch_neither_title_nor_panels(figures, name):
     assert not any(box.overlaps(other) for other in others)
 
 
+def test_a_legend_names_only_what_is_drawn():
+    def legend(ends):
+        figure = ranges(["gain"], np.array([[0.5, *ends]]), [""])
+        return {text.get_text() for text in figure.legends[0].get_texts()}
+
+    assert legend((0.4, 0.6)) == {"range", "95 % interval", "value"}
+    assert legend((np.nan, np.nan)) == {"range", "no interval"}
+
+
 def test_files_are_of_their_kind_and_the_same_every_time(figures):
     figure = figures["bode"]
     assert style.render(figure, "png").startswith(b"\x89PNG")

@@ -48,6 +48,14 @@ def test_numbers():
     assert notation.number_tex("120") == "$120$"
 
 
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0996, "0.100"), (9.96e-5, "1.00e-4"), (9.94e-5, "9.9e-5"), (-9.96e-7, "-1.00e-6")],
+)
+def test_a_number_that_is_rounded_up_to_a_power_of_ten_keeps_its_last_place(value, text):
+    assert notation.number(value, 2) == text
+
+
 class _Text(HTMLParser):
     def __init__(self):
         super().__init__(convert_charrefs=True)
