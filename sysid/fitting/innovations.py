@@ -50,7 +50,7 @@ _FARTHEST = 2.3  # change of its logarithm that two rounds may foretell
 # of the inputs explains more than there is to explain.
 _LEAST_NOISE, _NEAR = 1e-2, 0.1
 _LEAST_OF_FILTER = 1e-4
-_TENTH = 0.1
+_TENTH, _PART_OF_TENTH = 0.1, 0.3
 _BY_CHANCE = 3.0  # deviations
 _WHITE = 1.05  # ratio of what third and fifth differences show, below which it is white noise
 _TINY = 1e-300
@@ -374,11 +374,14 @@ class Innovations(Objective):
 
     @property
     def _least_scatter(self) -> FloatArray:
-        """Deviation that nine samples of ten have, (n_outputs,): the tenth must not tell all."""
+        """Deviation beside the scatter, (n_outputs,), that the tenth with the least not tell all.
+
+        By a part of what the others have: samples that have that much would have twice as much.
+        """
         scatter, least = np.concatenate(self.scatter), np.zeros(len(self.noise))
         seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
         for j in np.flatnonzero(seen.any(axis=0)):
-            least[j] = np.sqrt(np.quantile(scatter[seen[:, j], j], _TENTH))
+            least[j] = np.sqrt(_PART_OF_TENTH * np.quantile(scatter[seen[:, j], j], _TENTH))
         return least
 
     @property

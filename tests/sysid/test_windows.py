@@ -171,13 +171,17 @@ def test_of_means_over_many_samples_innovations_are_those_of_their_joint_normal(
 
 
 def test_jitter_of_windows_counts_by_how_fast_an_output_changes():
-    t, middles = DT * np.arange(N), DT * (np.arange(N) - 0.6)
-    before = np.tile([-1.0 * DT, -0.2 * DT], (N, 1))
-    means = np.diff([rising(t - DT)[1], rising(t - 0.2 * DT)[1]], axis=0)[0] / (0.8 * DT)
-    jitter = np.full((N, 1), 2e-4)
-    record = Dataset(np.ones(N), means, DT, windows=before[:, None], jitter=jitter)
-    slope = np.exp(-middles / TAU) / TAU
-    np.testing.assert_allclose(np.sqrt(scatter(record))[2:-1, 0], 2e-4 * slope[2:-1], rtol=0.01)
+    """Means over windows that lie elsewhere than stated, drawn anew: their errors are as stated."""
+    t, middles, deviation = DT * np.arange(N), DT * (np.arange(N) - 0.6), 0.25 * DT
+    before, rng = np.tile([-1.0 * DT, -0.2 * DT], (N, 1)), np.random.default_rng(0)
+    jitter, slope, variances = np.full((N, 1), deviation), np.exp(-middles / TAU) / TAU, []
+    for _ in range(400):
+        at = t + deviation * rng.standard_normal(N)
+        means = np.diff([rising(at - DT)[1], rising(at - 0.2 * DT)[1]], axis=0)[0] / (0.8 * DT)
+        record = Dataset(np.ones(N), means, DT, windows=before[:, None], jitter=jitter)
+        variances.append(scatter(record)[4:-4, 0])
+    expected = (deviation * slope[4:-4]) ** 2
+    assert 0.97 < np.mean(np.mean(variances, axis=0) / expected) < 1.03
 
 
 def test_a_part_keeps_its_windows():
