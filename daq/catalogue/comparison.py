@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.catalogue.entries import RunEntry
-from daq.errors import ConfigError, RunError, suggestion
+from daq.errors import ConfigError, RigError, RunError, suggestion
 from daq.files import write_whole
 from daq.identification.rows import QuantityRow
 from daq.progress import Note, Watch, ignore
@@ -68,7 +68,14 @@ def _overlays(root: Path, entries: Sequence[RunEntry], watch: Watch) -> list[Ove
             Note("note", f"signals of the last {_MOST_LINES} of {len(entries)} runs are drawn only")
         )
     drawn = entries[-_MOST_LINES:]
-    columns_of = {entry.folder: load(root / entry.folder).columns for entry in drawn}
+    columns_of = {}
+    for entry in drawn:
+        try:
+            columns_of[entry.folder] = load(root / entry.folder).columns
+        except RigError as error:  # a run that failed before its first sample is no reason for none
+            watch(Note("warning", f"its signals are not drawn: {error}"))
+    if not columns_of:
+        raise ConfigError("none of these runs has samples to draw", cure="name others")
     return [
         Overlay(
             signal,

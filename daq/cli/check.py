@@ -56,12 +56,11 @@ def check(
     _show(checked)
     if plot is not None:
         print(f"Figure: {plot}")
-    on = f" --rig {shlex.quote(rig)}" if rig is not None else ""
     if lacks_port(checked.session.rig):
         port = "PORT"  # to be filled in, as rig ports has it
-    on += f" --port {port}" if port is not None else ""
     identify = " --identify" if checked.session.validation and not checked.concludes else ""
-    terminal.print_next(f"rig run {shlex.quote(experiment)}{on}{identify}")
+    on_rig = options.rig_words(rig, port)
+    terminal.print_next(f"rig run {shlex.quote(experiment)}{on_rig}{identify}")
 
 
 def _show(checked: Preview) -> None:

@@ -1,6 +1,7 @@
 """Arguments and options that several commands have."""
 
 import functools
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -95,3 +96,13 @@ WithReport = Annotated[
     bool, Option("--report/--no-report", help="Write report.html with its figures as well.")
 ]
 AsJson = Annotated[bool, Option("--json", help="One JSON document on standard output.")]
+
+
+def rig_words(rig: str | None, port: str | None) -> str:
+    """Options that name a rig and its port again, as further words of a command.
+
+    >>> rig_words("my rig.yaml", None)
+    " --rig 'my rig.yaml'"
+    """
+    words = [("--rig", rig), ("--port", port)]
+    return "".join(f" {name} {shlex.quote(value)}" for name, value in words if value is not None)

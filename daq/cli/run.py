@@ -33,6 +33,7 @@ def run(
     json: options.AsJson = False,
 ) -> None:
     """Run an experiment on a rig and log every sample."""
+    from daq.cli.analyse import next_commands
     from daq.recording.session import open_session
 
     with terminal.watching(json) as watch:
@@ -42,7 +43,11 @@ def run(
         result = session.record(out, validation=identify, watch=watch)
     document = _document(result)
     if not json:
-        _show(result, session.plan.excites, identify)
+        _show(result)
+        if not session.plan.excites:
+            _show_rest(result.run.folder, options.rig_words(rig, port))
+        elif not identify:
+            terminal.print_next(*next_commands(result.run.folder))
     if problem is not None:
         if result.validation is None and not json:
             path = session.loaded.file.path
@@ -88,21 +93,24 @@ def _document(result: SessionResult) -> dict[str, Any]:
     return document
 
 
-def _show_rest(folder: Path) -> None:
-    """What the sensors read at zero command, by the calibration."""
+def _show_rest(folder: Path, on_rig: str) -> None:
+    """What the sensors read at zero command, by the calibration, and what may follow on the rig."""
     from daq.logs.capture import LOG_NAME
     from daq.logs.columns import UNITS
     from daq.logs.recording import read_record
+    from daq.lookup.starter import FIRST_EXPERIMENTS
     from daq.notation import quantity
 
     record = read_record(folder / LOG_NAME) or {}
     offsets, noise = record["offsets"], record["calibration"]["noise"]
     rows = [[k, *(quantity(x[k], UNITS[k]) for x in (offsets, noise))] for k in noise]
     terminal.print_table("Sensors at zero command", ["sensor", "offset", "noise"], rows)
+    first = f"rig run {FIRST_EXPERIMENTS[1]}.yaml{on_rig}"
+    terminal.print_next(first, purpose="If the sensors should read this, the first commands:")
 
 
-def _show(result: SessionResult, excites: bool, identify: bool) -> None:
-    from daq.cli.analyse import next_commands, show_findings
+def _show(result: SessionResult) -> None:
+    from daq.cli.analyse import show_findings
     from daq.diagnose import punctuality
 
     if result.findings is not None:
@@ -121,7 +129,3 @@ def _show(result: SessionResult, excites: bool, identify: bool) -> None:
             terminal.report("note", note)
     for doubt in result.doubts:
         terminal.report("warning", doubt)
-    if not excites:
-        _show_rest(result.run.folder)
-    elif not identify:
-        terminal.print_next(*next_commands(result.run.folder))

@@ -59,7 +59,7 @@ def runs(
 ) -> None:
     """List recorded runs; search, compare and annotate them."""
     from daq.catalogue.annotation import annotate
-    from daq.catalogue.comparison import draw_comparison, quantities_of, require_quantities
+    from daq.catalogue.comparison import draw_comparison, require_quantities
     from daq.catalogue.index import catalogue
     from daq.catalogue.query import ordered, select
     from daq.errors import ConfigError
@@ -78,7 +78,6 @@ def runs(
             chosen = annotate(folder, chosen, note or [], tag or [], untag or [])
         if plot is not None and chosen:
             draw_comparison(folder, chosen, names, plot, watch)
-    names = names or (quantities_of(chosen) if compare else [])
     if json:
         terminal.print_json({"folder": str(folder), "runs": [run.document for run in chosen]})
         return
@@ -134,17 +133,23 @@ def _is_dated(entry: RunEntry) -> bool:
 
 def _compare(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
     """A row for each parameter, a column for each run; on a terminal as many as it has room for."""
-    on_terminal, most = sys.stdout.isatty(), _MOST_COLUMNS
+    from daq.catalogue.comparison import quantities_of
+
+    identified = [entry for entry in entries if entry.values]
+    if not identified:
+        terminal.report("note", "nothing has been identified from them; try rig identify RUN")
+        return
+    shown = identified[-_MOST_COLUMNS:]
+    names = names or quantities_of(shown)
+    on_terminal = sys.stdout.isatty()
     if on_terminal:
-        units = (len(row.unit) for entry in entries for row in entry.quantities)
-        beside = max(map(len, ("parameter", *names))) + max(units, default=0) + 5
+        units = (len(row.unit) for entry in shown for row in entry.quantities)
+        beside = max(map(len, ("parameter", *names))) + max(units) + 5
         room = (shutil.get_terminal_size().columns - beside) // _RUN_COLUMN
-        most = min(max(room, 2), most)
-    if len(entries) > most:
-        terminal.report(
-            "note", f"of {len(entries)} runs the last {most} are compared; --plot has all"
-        )
-    shown = entries[-most:]
+        shown = shown[-max(room, 2) :]
+    if len(entries) > len(shown):
+        which = "identified" if len(identified) == len(shown) else f"last {len(shown)} identified"
+        terminal.report("note", f"of {len(entries)} runs the {which} are compared; --plot has all")
     between = "\n" if on_terminal else " "
     head = ["parameter", "unit", *(entry.folder for entry in shown)]
     rows = [["trust", "", *(entry.trust for entry in shown)]]
@@ -153,8 +158,6 @@ def _compare(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
         unit = next(row.unit for row in quantities if row is not None) if any(quantities) else ""
         rows.append([name, unit, *(_quantity(row, between) for row in quantities)])
     terminal.print_table("Parameters, with their 95 % intervals", head, rows, text=["unit"])
-    if not names:
-        terminal.report("note", "nothing has been identified from them; try rig identify RUN")
 
 
 def _show(entry: RunEntry, folder: Path) -> None:

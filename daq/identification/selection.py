@@ -57,11 +57,15 @@ class Selection:
     def check_channels(self, channels: Sequence[str]) -> None:
         """Raise ConfigError for a channel that is named and that no model has."""
         named = {key: getattr(self.preparation, key) for key in ("delay", "detrend")}
+        mistakes: list[Mistake] = []
         for key, names in {"noise": self.noise, **named}.items():
             for name in names:
                 if name not in channels:
                     cure = suggestion(name, list(channels))
-                    raise self._mistaken((key, name), "the model has no such channel", cure)
+                    error = self._mistaken((key, name), "the model has no such channel", cure)
+                    mistakes += error.mistakes
+        if mistakes:
+            raise ConfigError.of(mistakes)
 
     def merged(self, path: Path) -> list[Path]:
         """The files with more columns of a log; ConfigError for one that is not there."""

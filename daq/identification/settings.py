@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any, Self, TypeVar, get_args
 from daq.config import check, yaml_file
 from daq.config.identification import IdentificationConfig, Signals, TermSetting
 from daq.config.units import converted
-from daq.config.yaml_file import TypedSettings, YamlFile
+from daq.config.yaml_file import Key, TypedSettings, YamlFile
 from daq.errors import ConfigError, Mistake, suggestion, together
 from daq.identification import datasheets, stages
 from daq.identification.foreign import ColumnMapping, check_columns, check_mapping
@@ -114,27 +114,39 @@ def problems_of(
     declared = _find_models(config, file, names, record)
     file, freed = _without_nulls(file, [model for model, _ in declared])
     file, unconverted = in_model_units(file, [model for model, _ in declared])
+    plain = [model for model, _ in declared]
     doubts: Sequence[Mistake] = ()
     if check.mistakes(file, IdentificationConfig, file.content):
-        # What is added gives a model names of its own, of which nothing is known until then.
-        named = any(file.content.get(key) for key in ("terms", "channels"))
-        plain = [] if named else [model for model, _ in declared]
-        doubts = [*unconverted, *(_unknown_names(file, plain) if plain else ())]
+        doubts = [*unconverted, *_unknown_names(file, plain, before_additions=True)]
     settings = check.validate(file, IdentificationConfig, others=doubts)
     selection = Selection.under(settings, file)
     for model, name in declared:
         watch(Note("detail", f"model {name}: {model.description}"))
-    models = [_with_additions(file, settings, model) for model, _ in declared]
-    doubts = [*unconverted, *_unknown_names(file, models)]
+
+    doubts = [*unconverted]
+
+    def attempt(step: Callable[[], Any], instead: Any) -> Any:
+        """What a step returns; its mistakes are told with all others."""
+        try:
+            return step()
+        except ConfigError as error:
+            doubts.extend(error.mistakes)
+            return instead
+
+    models = attempt(lambda: [_with_additions(file, settings, model) for model in plain], plain)
+    doubts += _unknown_names(file, models, before_additions=models is plain)
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None
-    signals = [name for m, _ in declared for name in (*m.output_names, *m.state_names)]
+    signals = [name for m in plain for name in (*m.output_names, *m.state_names)]
     spare = {"inputs": _all_names(models, "input_names"), "outputs": signals}
-    selection.check_channels(list(dict.fromkeys([*spare["inputs"], *signals])))
+    attempt(
+        lambda: selection.check_channels(list(dict.fromkeys([*spare["inputs"], *signals]))), None
+    )
     # Typed names are relative to where they are typed, those in a file to that file.
     beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
-    entries = datasheets.load([beside / name for name in settings.datasheet], models)
+    sheets = [beside / name for name in settings.datasheet]
+    entries = attempt(lambda: datasheets.load(sheets, models), {})
     beside = config.parent if config is not None and "given" not in file.typed else Path()
-    results = stages.load([beside / name for name in settings.given])
+    results = attempt(lambda: stages.load([beside / name for name in settings.given]), [])
 
     def problem(model: ProcessModel, name: str) -> Problem:
         given = _restricted(settings, model)
@@ -334,26 +346,38 @@ def _find_model(
 
 def _with_additions(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
     """The model with terms in its equations, the outputs that count, and errors of channels."""
-    model = _with_outputs(file, signals, _with_terms(file, signals, model))
+    mistakes = []
+    for key, add in _additions(signals):
+        try:
+            model = add(model)
+        except ModelError as error:
+            mistakes.append(file.mistake(key, str(error)))
+    check.refuse(mistakes)
+    return model
+
+
+def _additions(
+    signals: Signals,
+) -> Iterator[tuple[Key, Callable[[ProcessModel], ProcessModel]]]:
+    """What is added to a model in its order, each with its key."""
+    for k, setting in enumerate(signals.terms):
+        yield ("terms", k), partial(_with_term, setting)
+    if signals.outputs:
+        yield ("outputs",), lambda model: model.with_outputs(signals.outputs)
     for channel, errors in signals.channels.items():
         for kind in get_args(Kind):
-            ends: tuple[float, float] | None = getattr(errors, kind)
-            if ends is None:
-                continue
-            try:
-                model = with_corrections(model, [Correction(channel, kind, *ends)])
-            except ModelError as error:
-                raise file.error(("channels", channel), str(error)) from None
-    return model
+            if (ends := getattr(errors, kind)) is not None:
+                yield ("channels", channel), partial(_with_correction, channel, kind, *ends)
 
 
-def _with_terms(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
-    for k, setting in enumerate(signals.terms):
-        try:
-            model = with_terms(model, [_term(setting)])
-        except ModelError as error:
-            raise file.error(("terms", str(k)), str(error)) from None
-    return model
+def _with_term(setting: TermSetting, model: ProcessModel) -> ProcessModel:
+    return with_terms(model, [_term(setting)])
+
+
+def _with_correction(
+    channel: str, kind: Kind, low: float, high: float, model: ProcessModel
+) -> ProcessModel:
+    return with_corrections(model, [Correction(channel, kind, low, high)])
 
 
 def _term(setting: TermSetting) -> AddedTerm:
@@ -369,13 +393,6 @@ def setting_of(term: AddedTerm) -> TermSetting:
     return TermSetting(**values, range=ends)
 
 
-def _with_outputs(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
-    try:
-        return model.with_outputs(signals.outputs) if signals.outputs else model
-    except ModelError as error:
-        raise file.error(("outputs",), str(error)) from None
-
-
 def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> ProcessModel:
     key: tuple[str, ...] = ()
     try:
@@ -388,14 +405,22 @@ def _with_starts(file: YamlFile, signals: Signals, model: ProcessModel) -> Proce
         raise file.error(key, str(error)) from None
 
 
-def _unknown_names(file: YamlFile, models: Sequence[ProcessModel]) -> list[Mistake]:
-    """Names in the settings that no model has, each at its key; a list has no keys of its own."""
+def _unknown_names(
+    file: YamlFile, models: Sequence[ProcessModel], before_additions: bool = False
+) -> list[Mistake]:
+    """Names in the settings that no model has, each at its key; a list has no keys of its own.
+
+    before_additions: names that terms, outputs and errors of channels may give are let pass.
+    """
     whose = " or ".join(dict.fromkeys(model.name for model in models))
     unknown = []
     for group, kind in (*_KEYED_BY.items(), ("profile", "parameter_names")):
         entries, declared = file.content.get(group), _all_names(models, kind)
         names = entries if isinstance(entries, Mapping | list) else ()
         for name in (name for name in names if isinstance(name, str) and name not in declared):
+            added = "_of_" in name or (group == "weights" and file.content.get("outputs"))
+            if before_additions and added:
+                continue
             hint = f"model {whose} has no such name; {suggestion(name, declared)}"
             keyed = isinstance(entries, Mapping)
             problem = hint if keyed else f"{name}: {hint}"

@@ -26,7 +26,6 @@ def columns_of(path: Path) -> dict[str, FloatArray]:
     among them those of version 7.3.
     """
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     try:
         variables = loadmat(path, squeeze_me=False, struct_as_record=True, appendmat=False)
@@ -36,10 +35,10 @@ def columns_of(path: Path) -> dict[str, FloatArray]:
     except NotImplementedError:
         problem = "a MAT file of version 7.3, which only HDF5 programs read"
         raise ConfigError(problem, cure=_CONVERT, file=path) from None
-    except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
-    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError) as error:
-        problem = f"not a readable MAT file ({type(error).__name__}: {error})"
+    except Exception as error:  # of damaged files SciPy raises anything, zlib's errors as well
+        if isinstance(error, OSError) and error.strerror:
+            raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
+        problem = f"no MAT file, or a damaged one ({error})"
         raise ConfigError(problem, cure=_CONVERT, file=path) from None
     columns = dict(_columns(variables))
     if not columns:

@@ -252,19 +252,18 @@ def latency_timer(port: str) -> tuple[Path, int] | None:
 def _not_opened(port: str, error: Exception) -> DeviceError:
     number = getattr(error, "errno", None)
     text = str(error)
+    problem, cure = f"it cannot be opened ({text})", "'rig ports' lists those that there are"
     if number == errno.ENOENT or "FileNotFoundError" in text:
-        cure = "there is no such port; 'rig ports' lists those that there are"
+        problem = "there is no such port"
     elif number == errno.EACCES or "Permission" in text:
-        cure = f"no permission; {permission_cure(port)}"
+        problem, cure = "no permission", permission_cure(port)
         if os.name == "nt":
-            cure = "another program has it open; close that first"
+            problem, cure = "another program has it open", "close that first"
     elif number in {errno.EAGAIN, errno.EBUSY} or "exclusively lock" in text:
-        cure = f"another program has it open{_holder(port)}; close that first"
+        problem, cure = f"another program has it open{_holder(port)}", "close that first"
     elif number in {errno.ENOTTY, errno.EISDIR} or f"({errno.ENOTTY}," in text:
-        cure = "that is no serial port; 'rig ports' lists those that there are"
-    else:
-        cure = f"it cannot be opened ({text}); 'rig ports' lists the ports that there are"
-    return DeviceError(cure, file=port)
+        problem = "that is no serial port"
+    return DeviceError(problem, cure=cure, file=port)
 
 
 def permission_cure(port: str) -> str:

@@ -337,6 +337,19 @@ CASES = [
              "id.yaml:4:11: initial.zz: model actuator has no such name",
              "id.yaml:5:8: tied.c1: parameter c1: 'c0 * unknown' is no multiple of another",
              "id.yaml:6:1: profile: nonsense: model actuator has no such name"),
+    settings("additions, channels, data sheets and results of before that are wrong, all at once",
+             "terms: [{equation: omega, of: omgea, scale: 1, shape: sign, range: [-1, 1]}]\n"
+             "channels: {lod: {gain: [0.5, 2]}, trque: {gain: [0.5, 2]}}\n"
+             "delay: {torqe: 3 ms}\ndetrend: {omga: linear}\ndatasheet: nix.yaml\n"
+             "given: nowhere\nfixed: {R_x: 1, R_m: -5}\nranges: {gain_of_lod: [0.5, 2]}\n",
+             "id.yaml:1:9: terms.0: ",
+             "id.yaml:2:12: channels.lod: model actuator has no channel 'lod'",
+             "id.yaml:2:35: channels.trque: model actuator has no channel 'trque'",
+             "id.yaml:3:9: delay.torqe: the model has no such channel",
+             "id.yaml:4:11: detrend.omga: the model has no such channel",
+             "nix.yaml: there is no such file", "nowhere: ",
+             "id.yaml:7:9: fixed.R_x: model actuator has no such name",
+             "id.yaml:7:17: fixed.R_m: parameter R_m: nominal value -5.0 is outside"),
     settings("names beside a key that is wrong", "populaton: 9\nweights: {omegga: 2}\n",
              "id.yaml:1:1: populaton: unknown key; did you mean 'population'?",
              "id.yaml:2:11: weights.omegga: model actuator has no such name"),

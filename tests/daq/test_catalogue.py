@@ -3,6 +3,7 @@
 import datetime
 import json
 import os
+import shutil
 import sqlite3
 import sys
 
@@ -176,10 +177,22 @@ def test_eighty_columns_hold_what_is_listed_compared_and_refused(lab):
     row = next(line for line in ann.splitlines() if line.split()[-1:] == ["30"])
     assert row.split()[0] == listed(lab)[2]["folder"]  # which says the date
     assert "note brushes replaced" in " ".join(at_80_columns("runs", "brushes").split())
-    compared = at_80_columns("runs", "--compare", "--last", "2")
-    assert "of 2 runs" not in compared and "gain" in compared
+    compared = at_80_columns("runs", "--compare")
+    assert "of 3 runs the identified are compared" in " ".join(compared.split())
+    assert compared.count("Z-") == 2 and "gain" in compared
     refused = " ".join(at_80_columns("runs", "--sort", "nothing").split())
     assert "known are" in refused and "parameters, predictions, protocol" in refused
+
+
+def test_runs_without_samples_are_left_out_of_a_figure(lab, tmp_path):
+    for capture in captures(lab):
+        shutil.copytree(lab / capture, tmp_path / capture)
+    log = tmp_path / captures(lab)[2] / "log.csv"
+    log.write_text(log.read_text().partition("\n")[0] + "\n")  # it failed before the first sample
+    result = rig("runs", "--plot", "all.png", cwd=tmp_path)
+    assert result.returncode == 0 and "Figure: all.png" in result.stdout
+    assert "its signals are not drawn: " in result.stderr
+    assert (tmp_path / "all.png").exists()
 
 
 def test_tags_and_notes_are_put_on_runs_and_taken_away(lab):

@@ -198,8 +198,13 @@ def test_a_matlab_file_is_a_log(folder):
 
 def matlab_mistakes(folder):
     yield "newer.mat", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM", "of version 7.3"
-    yield "text.mat", b"t,u,y\n0,1,2\n" * 20, "not a readable MAT file"
-    yield "none.mat", b"", "not a readable MAT file"
+    yield "text.mat", b"t,u,y\n0,1,2\n" * 20, "no MAT file, or a damaged one"
+    yield "none.mat", b"", "no MAT file, or a damaged one"
+    savemat(folder / "packed.mat", {"t": np.arange(500.0) ** 0.5}, do_compression=True)
+    content = (folder / "packed.mat").read_bytes()
+    yield "torn.mat", content[: len(content) // 2], "no MAT file, or a damaged one"
+    flipped = content[:-20] + bytes([content[-20] ^ 1]) + content[-19:]
+    yield "flipped.mat", flipped, "no MAT file, or a damaged one"
 
 
 def test_a_matlab_file_that_does_not_read_is_refused_with_the_way_to_convert_it(folder):

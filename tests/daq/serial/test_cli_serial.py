@@ -120,7 +120,11 @@ def test_a_port_on_the_command_line_goes_before_the_files(tmp_path, run, running
     write_experiment(tmp_path / "e.yaml", duration=0.1)
     write_serial_rig(tmp_path / "rig.yaml", "/dev/not-this-one", watchdog=0.5)
     words = ["run", "e.yaml", "--rig", "rig.yaml"]
-    assert "/dev/not-this-one: there is no such port" in run(words, tmp_path).stderr
+    absent = run([*words, "--json"], tmp_path)
+    assert "/dev/not-this-one: there is no such port; 'rig ports' lists" in absent.stderr
+    assert (
+        json.loads(absent.stdout)["errors"][0]["cure"] == "'rig ports' lists those that there are"
+    )
     assert run([*words, "--port", running.port], tmp_path).returncode == 0
     result = run(["check", "e.yaml", "--rig", "serial.yaml", "--port", "COM3"], tmp_path)
     assert result.returncode == 0 and "--port COM3" in result.stdout, "a check opens nothing"

@@ -106,8 +106,9 @@ def test_a_shipped_experiment_lies_beside_the_first_ones_where_it_is_named(tmp_p
 
 
 def test_zero_commands_are_not_offered_for_an_identification(tmp_path, run):
-    at_rest = run(["run", "still.yaml"], tmp_path).stdout
+    at_rest = run(["run", "still.yaml", "--rig", "simulated.yaml"], tmp_path).stdout
     assert "rig identify" not in at_rest
+    assert at_rest.endswith("Next: rig run tenth.yaml --rig simulated.yaml\n")
     record = json.loads(next(tmp_path.glob("runs/*-still/run.json")).read_text())
     offset = 1e3 * record["offsets"]["current_motor"]
     shown = re.search(r"current_motor +(\S+) mA", at_rest)[1]
