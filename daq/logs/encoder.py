@@ -81,8 +81,11 @@ class _Intervals:
         # An interval begins with the edge that ended the one before; the first row is no edge.
         timed = np.flatnonzero(np.isfinite(length) & (length > 1.0 + _OFF_TICK))
         timed = timed[timed > 1]
-        # Unless the shaft has turned round since, over an edge in the same sample.
-        timed = timed[rate[timed] * rate[timed - 1] >= 0.0]
+        moved = np.diff(counts[rows], prepend=np.nan)
+        timed = timed[_follow(moved, rate, timed)]
+        # Nor may the speed have gone at once since then, as where the shaft turned over and back.
+        kept = np.sign(rates[rows[timed] - 1]) == np.sign(rate[timed - 1])
+        timed = timed[kept | (length[timed] >= _REST)]
         low = np.maximum(earliest[timed], earliest[timed - 1] + length[timed])
         high = np.minimum(latest[timed], latest[timed - 1] + length[timed])
         agreeing = low <= high + _OFF_TICK
@@ -91,8 +94,7 @@ class _Intervals:
         begin = np.where(rate == 0.0, np.append(earliest[0], end[:-1]), end - length)
         # A turn shows as a speed of zero, back over the edge before. Amid several edges nothing
         # tells when that was; nor, where the count goes on, how often the shaft has turned.
-        change = np.diff(counts[rows], prepend=np.nan)
-        back = (np.abs(change) == 1.0) & (np.diff(change, prepend=np.nan) == 2.0 * change)
+        back = (np.abs(moved) == 1.0) & (np.diff(moved, prepend=np.nan) == 2.0 * moved)
         # Of one turn after the other nothing tells how fast the shaft passed the edges.
         turns = rate == 0.0
         lasting = ~repeated(turns) | (end - begin >= _REST)
@@ -105,6 +107,18 @@ class _Intervals:
         if stated and self.checked < _MANY:
             return True
         return self.agreeing >= max(_FEWEST, _SHARE * self.checked)
+
+
+def _follow(moved: FloatArray, rate: FloatArray, rows: IntArray) -> npt.NDArray[np.bool_]:
+    """Whether the last edge of the row before each was passed in the same direction.
+
+    Else the shaft has turned round since, over an edge that the count does not show. moved, rate:
+    (n,) of all rows, in counts; a rate of zero says that the last edge was a turn.
+    """
+    turn = np.where(np.abs(moved) == 1.0, moved, np.nan)
+    direction = np.sign(np.where(rate == 0.0, turn, rate))
+    follows: npt.NDArray[np.bool_] = direction[rows - 1] == np.sign(rate[rows])
+    return follows
 
 
 def repeated(turns: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

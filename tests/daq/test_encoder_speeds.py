@@ -91,6 +91,25 @@ def test_of_one_turn_after_the_other_nothing_is_measured():
     assert np.isfinite(values[tick * DT < 0.45]).mean() > 0.99
 
 
+@pytest.mark.parametrize("place", [0.3, 0.4, 0.5])  # of the turn in its sample
+@pytest.mark.parametrize("before", [0.3, 1.4])  # samples, when its braking begins
+def test_a_turn_over_an_edge_and_back_within_a_sample_begins_an_interval(before, place):
+    """The count shows no change; the speed that follows is not from the edge that it showed."""
+
+    def dipping(t):
+        # Comes up, turns, and turns again 0.02 counts below an edge; the next is 1.04 samples on.
+        u = t / DT - 20.0 - place
+        early = 0.697 * before**2 - 1.394 * before * (u + before) - 2.0 * (u + before) ** 2
+        return COUNT * (50.0 - 0.02 + np.where(u < -before, early, 0.697 * u**2))
+
+    tick, theta, omega = logged(dipping, 30 * DT)
+    assert (theta[21], omega[21]) == (theta[20], 0.0) and omega[22] == pytest.approx(0.59, abs=0.01)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
+    error = np.abs(speeds.values - mean_over(dipping, speeds.windows))[20:26]
+    expected = speeds.jitter[20:26] * 1.394 * COUNT / DT**2
+    assert np.isfinite(error[2]) and np.nanmax(error / np.hypot(expected, 0.02)) < 3.0
+
+
 @pytest.mark.parametrize("angle", [swinging, creeping])
 def test_its_jitter_says_how_far_a_mean_may_be_off(angle):
     """Each error in parts of what the jitter makes of the true acceleration is about one."""
