@@ -19,7 +19,7 @@ from sysid.fitting.objective import Objective
 from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
 from sysid.uncertainty.colour import successive_correlation
-from sysid.uncertainty.covariance import covariance
+from sysid.uncertainty.covariance import covariance, larger
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.profile import Fit, Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
@@ -165,7 +165,7 @@ def uncertainty(
         tuple(rival for rival in minima if any(e.excludes(rival.values) for e in apart)),
         disagreement=spread.disagreement if spread else 1.0,
         factor=analysis.factor(
-            others, itertools.chain(parameters, *(a.determined for a in ambiguities))
+            others, itertools.chain(parameters, *(a.determined for a in ambiguities)), bottoms
         ),
         succession=_succession(local),
         bent=_bent(local),
@@ -274,24 +274,35 @@ class _Analysis:
         self.combined: dict[str, Invariant] = {}
         self.alike: list[FloatArray] = []
 
-    def factor(self, rivals: Sequence[FloatArray], estimates: Iterable[Estimate]) -> FloatArray:
-        """As of ``Uncertainty``."""
+    def factor(
+        self,
+        rivals: Sequence[FloatArray],
+        estimates: Iterable[Estimate],
+        bottoms: Sequence["_Analysis"],
+    ) -> FloatArray:
+        """As of ``Uncertainty``; bottoms: further ones of the valley."""
         points = [*self.alike, *map(self.space.encode, rivals)]
-        profiled = [e for e in estimates if e.name in self.gradients and (e.std is None or e.why)]
-        matrix = self._as_wide_as(points, profiled)
+        matrix = self.covariance.matrix
+        for bottom in bottoms:
+            away = (bottom.coded - self.coded) / Z95
+            matrix = larger(matrix, bottom.covariance.matrix + np.outer(away, away))
+        matrix = self._as_wide_as(
+            matrix, points, [e for e in estimates if e.name in self.gradients]
+        )
         return covariance_factor(matrix, self.ties.directions, self.local.increments)
 
-    def _as_wide_as(self, points: Sequence[FloatArray], profiled: Sequence[Estimate]) -> FloatArray:
-        """Covariance (n_free, n_free) that reaches as far as profiles do, neither less nor more.
+    def _as_wide_as(
+        self, matrix: FloatArray, points: Sequence[FloatArray], estimates: Sequence[Estimate]
+    ) -> FloatArray:
+        """Covariance (n_free, n_free) that reaches as far as intervals do, neither less nor more.
 
-        points: search coordinates (n_free,) that explain the data. profiled: quantities of which
-        slopes at the estimate tell nothing, as of a valley beyond where it bends or ends. Where
-        slopes hardly feel one they reach beyond its interval: all else is kept as it is at each of
-        its values. Where they feel one that is not known, they are widened along the way to each
-        point by the least that does. Others stay as well known as they are.
+        matrix: by slopes. points: search coordinates (n_free,) that explain the data. Where slopes
+        hardly feel a quantity they reach beyond its interval: all else is kept as it is at each of
+        its values. Where they feel one of which a profile is all that is known, as of a valley
+        beyond where it bends or ends, they are widened along the way to each point by the least
+        that does. Others stay as well known as they are.
         """
-        matrix = self.covariance.matrix
-        for estimate in profiled:
+        for estimate in estimates:
             gradient, widest = self.gradients[estimate.name], self._widest(estimate)
             along = matrix @ gradient
             variance = float(gradient @ along)
@@ -300,7 +311,8 @@ class _Analysis:
                 matrix = matrix + np.outer(along, along) * change
         rows = np.reshape([*self.gradients.values()], (len(self.gradients), len(self.coded)))
         back = np.linalg.pinv(rows)  # of what moves with nothing but ties the least
-        moving = np.isin([*self.gradients], [estimate.name for estimate in profiled])
+        profiled = [e.name for e in estimates if e.std is None or e.why]
+        moving = np.isin([*self.gradients], profiled)
         changes = [moving * c for c in map(self._changes, points) if np.isfinite(c).all()]
         while changes:
             joint = rows @ matrix @ rows.T

@@ -101,7 +101,7 @@ def covariance(
     noise = colour(residual, sensitivity.seen, sensitivity.lengths)
     score = score_covariance(weighted, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
-    score = _larger(score, _score_covariance_by_inputs(sensitivity, weighted))
+    score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
     starts = (change for _, change in start_errors(sensitivity))
     constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
     for errors in (*constant, averages_errors(sensitivity)):
@@ -159,7 +159,7 @@ def _score_covariance_by(weighted: FloatArray, changes: Iterable[FloatArray]) ->
     return covariance
 
 
-def _larger(seen: FloatArray, stated: FloatArray) -> FloatArray:
+def larger(seen: FloatArray, stated: FloatArray) -> FloatArray:
     """A covariance as large in every direction as the larger of two."""
     values, vectors = np.linalg.eigh(seen)
     root = np.sqrt(np.maximum(values, 1e-14 * max(values[-1], 1e-300)))

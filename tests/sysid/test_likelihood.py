@@ -304,6 +304,24 @@ def test_every_bottom_of_a_valley_has_its_own_interval_within_the_whole(seed):
     assert a.high == pytest.approx(brentq(beyond, high[0], high[0] + 2.0, (high,)), abs=0.1)
 
 
+def flatter(p, u):
+    """As ``bent``, and beside it what is felt four times less at the other bottom."""
+    share = 0.25 + 0.375 * (p["a"] - 1.0)
+    return bent(p, u) + 0.1 * share * (p["k"] - 2.0) * u[:, 0] * u[:, 1]
+
+
+def test_what_is_passed_on_of_a_valley_reaches_as_far_as_its_other_bottom_lets():
+    target = formula_objective(flatter, {"a": 3.0, "k": 2.0}, -5.0, 10.0, 21)
+    result = fit_likelihood(target, [np.array([3.0, 2.0]), np.array([1.0, 2.0])])
+    assert len(result.ridge) == 1
+    best = result.optimum.chromosome
+    alone, whole = (uncertainty(target, best, (), ridge) for ridge in ([], result.ridge))
+    (_, k), deviations = whole.parameters, [np.linalg.norm(r.factor[:, 1]) for r in (alone, whole)]
+    farther = max(k.value - k.low, k.high - k.value)
+    assert farther > 3.0 * 1.96 * deviations[0]
+    assert 0.7 * farther < 1.96 * deviations[1] < 1.05 * farther
+
+
 def test_minima_with_a_wall_between_them_are_rivals_each_with_an_interval():
     target = formula_objective(lambda p, u: p["a"] ** 2 * u[:, 0], BOTH, -5.0, 5.0)
     result = fit_likelihood(target, [np.array([2.0, 1.0]), np.array([-2.0, 1.0])])
