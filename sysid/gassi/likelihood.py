@@ -202,11 +202,12 @@ class _Optima:
 
         Along ties it is no other minimum, however far.
         """
-        for minimum in (*_chromosomes(self._optima), *others):
-            moved = self._shown.move(minimum, chromosome)
-            if moved @ self._information @ moved < _ONE:
-                return False
-        return True
+        minima = [*_chromosomes(self._optima), *others]
+        if not minima:
+            return True
+        at, *ends = map(self._shown.coordinates, [chromosome, *minima])
+        moves = np.array(ends) - at
+        return not np.any(np.sum((moves @ self._information) * moves, axis=1) < _ONE)
 
     def refit(self, optimum: Optimum, refitted: Optimum | None) -> None:
         """Put one fitted by its own noise, if it could be, in the place of a minimum."""
@@ -496,23 +497,25 @@ def _conceivable_by(
     (there,) = excerpt.on_all(part.space, [first.chromosome])[1]
     back = space.encode(best.chromosome) - space.encode(there)
 
-    def on_all(chromosome: FloatArray) -> FloatArray:
-        (there,) = excerpt.on_all(part.space, [chromosome])[1]
-        return space.decode(np.clip(space.encode(there) + back, *space.coded_bounds))
+    def on_all(chromosomes: Sequence[FloatArray]) -> list[FloatArray]:
+        there = np.stack(excerpt.on_all(part.space, chromosomes)[1])
+        return list(space.decode(np.clip(space.encode(there) + back, *space.coded_bounds)))
 
     begun = [excerpt.on_parts(space, part.space, start) for start in starts]
 
     def new(chromosome: FloatArray, others: Sequence[FloatArray]) -> bool:
-        return optima.new(on_all(chromosome), [on_all(end) for end in others])
+        there, *ends = on_all([chromosome, *others])
+        return optima.new(there, ends)
 
     ends = _quickly(part, begun, new)
     share = excerpt.n_samples / sum(record.n_samples for record in objective.records)
     minimum = _optimum(part, first.chromosome, first.rms)
-    return [
-        on_all(end.chromosome)
+    near = [
+        end.chromosome
         for end in ends
         if share * optima.deviance(_optimum(part, end.chromosome, end.rms), minimum) < _CONCEIVABLE
     ]
+    return on_all(near) if near else []
 
 
 def _quickly(

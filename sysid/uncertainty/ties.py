@@ -43,9 +43,8 @@ class Ties:
         # The starts of several records are numbered behind their names.
         alone = [name.partition(" ")[0] not in members for name in space.names]
         by_values = np.concatenate([np.eye(len(alone))[alone], *map(np.atleast_2d, gradients)])
-        by_coordinates = by_values * np.where(space.log, chromosome, 1.0)
-        sizes = np.linalg.norm(by_coordinates, axis=1, keepdims=True)
-        return cls(_sparse(null_space(by_coordinates / sizes).T), combinations)
+        rows = by_values * np.where(space.log, chromosome, 1.0)
+        return cls(_sparse(null_space(rows / _lengths(rows)).T), combinations)
 
     @property
     def bound(self) -> list[bool]:
@@ -67,14 +66,14 @@ class Ties:
 
 
 class Shown:
-    """How far chromosomes are apart in what outputs show: of the tied in their combinations.
+    """Chromosomes but for what outputs do not show of them: the tied by their combinations.
 
-    Where not all combinations have a name it is in all coordinates.
+    Where not all combinations have a name all coordinates count.
 
     >>> from sysid.examples import lag
-    >>> space = SearchSpace.of(lag())
-    >>> chromosome = np.array([1.0, 0.5])
-    >>> Shown(Ties(np.zeros((0, 2))), space, chromosome).move(chromosome, 2.0 * chromosome).round(3)
+    >>> space, chromosome = SearchSpace.of(lag()), np.array([1.0, 0.5])
+    >>> shown = Shown(Ties(np.zeros((0, 2))), space, chromosome)
+    >>> (shown.coordinates(2.0 * chromosome) - shown.coordinates(chromosome)).round(3)
     array([0.693, 0.693])
     """
 
@@ -84,22 +83,24 @@ class Shown:
         alone, self._combinations = ~np.array(ties.bound, dtype=bool), ties.combinations
         gradients = [free_gradient(c, space, self._here) * increments for c in self._combinations]
         rows = np.concatenate([np.eye(len(alone))[alone], *map(np.atleast_2d, gradients)])
-        self._alone, self._sizes = alone, np.linalg.norm(rows, axis=1)
-        rows /= self._sizes[:, None]
-        if np.linalg.matrix_rank(rows) + len(ties.directions) < len(alone):
-            self._alone, self._combinations = np.ones_like(alone), ()
-            rows, self._sizes = np.eye(len(alone)), np.ones(len(alone))
-        self._back = np.linalg.pinv(rows)
+        if np.linalg.matrix_rank(rows / _lengths(rows)) + len(ties.directions) < len(alone):
+            alone, self._combinations, rows = np.ones_like(alone), (), np.eye(len(alone))
+        self._alone = alone
+        self._back = np.linalg.pinv(rows / _lengths(rows)) / _lengths(rows).T
 
-    def move(self, start: FloatArray, end: FloatArray) -> FloatArray:
-        """The least move of the search coordinates, (n_free,), that shows as much."""
-        move: FloatArray = self._back @ ((self._of(end) - self._of(start)) / self._sizes)
-        return move
-
-    def _of(self, chromosome: FloatArray) -> FloatArray:
+    def coordinates(self, chromosome: FloatArray) -> FloatArray:
+        """Search coordinates, (n_free,), whose differences are the least that show as much."""
         there = named_values(self._space, chromosome)
         combined = [change(c, self._here, there) for c in self._combinations]
-        return np.array([*self._space.encode(chromosome)[self._alone], *combined])
+        shown = np.array([*self._space.encode(chromosome)[self._alone], *combined])
+        with np.errstate(invalid="ignore"):  # where what divides in a combination is zero
+            coordinates: FloatArray = self._back @ shown
+        return coordinates
+
+
+def _lengths(rows: FloatArray) -> FloatArray:
+    lengths: FloatArray = np.linalg.norm(rows, axis=1, keepdims=True)
+    return lengths
 
 
 def change(combination: Invariant, here: Mapping[str, float], there: Mapping[str, float]) -> float:
@@ -232,7 +233,8 @@ class _Renamed:
         return {self.starts.get(name, name): slope for name, slope in slopes.items()}
 
     def _as_declared(self, values: Mapping[str, float]) -> dict[str, float]:
-        return {**values, **{name: values[start] for name, start in self.starts.items()}}
+        names = self.combination.names
+        return {name: values[self.starts.get(name, name)] for name in names}
 
 
 def _of_each_record(combination: Invariant, space: SearchSpace) -> list[Invariant]:
