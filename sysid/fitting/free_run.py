@@ -17,6 +17,8 @@ from sysid.problem.space import SearchSpace
 _FINER, _FINEST = 0.1, 1e-9
 _PART = 0.5  # of a deviation by which errors of the steps may move any quantity
 _SHARE = 0.3  # of what is left of an output that they may be: more would show in it
+# What is left of an output is no noise where errors of the steps do half of it, or so small.
+_OWN, _NOTHING = 2.0, 1e-6
 _FAR_MORE = 16  # times the steps that a search took, above which they would cost too much
 
 
@@ -115,6 +117,16 @@ def fine_enough(objective: Objective, chromosome: FloatArray, rms: FloatArray) -
         steps = objective.steps_needed(chromosome[None])
         changed, last = bool(np.any(steps != last)), steps
     return objective
+
+
+def noiseless(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> bool:
+    """Whether what is left of the outputs, (n_outputs,), at (n_free,) is the simulation's error.
+
+    How small it is beside the outputs does not tell: they may stand far from zero.
+    """
+    change = _change_by_steps(objective, chromosome, objective.steps_needed(chromosome[None]))
+    error = np.sqrt(np.mean(change**2, axis=0))
+    return bool(np.all(rms < np.maximum(_OWN * error, _NOTHING)))
 
 
 def _swayed(objective: Objective, chromosome: FloatArray, steps: IntArray, rms: FloatArray) -> bool:

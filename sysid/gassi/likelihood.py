@@ -19,7 +19,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import TOLERANCE, Point, Restriction
-from sysid.fitting.free_run import accurate, fine_enough
+from sysid.fitting.free_run import accurate, fine_enough, noiseless
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
@@ -40,8 +40,6 @@ _SWINGING = -0.5  # a round's change of a noise's logarithm in parts of the one 
 # An output explained much better than the others keeps this share of the largest error, or the
 # arithmetic of its last digits would decide.
 _LEAST_SHARE = 1e-2
-# Errors below this part of the simulation's accuracy are its own: there is no noise to weigh by.
-_SIMULATION_SHARE = 0.1
 _TINY = 1e-300
 # Colour does not make an output's errors count as fewer independent samples than this.
 _FEWEST = 30.0
@@ -357,10 +355,9 @@ def _weighed(
 ) -> Optimum:
     """The minimum by the inverse of its errors: weights and parameters in turn."""
     tolerance = _ROUGHLY if roughly else TOLERANCE
-    given, accuracy = objective.weights, objective.simulator.accuracy
-    rms = objective.rms(chromosome[None])[0]
+    given, rms = objective.weights, objective.rms(chromosome[None])[0]
     # A refinement may end where a simulation takes more steps than a chromosome is allowed.
-    noisy = np.isfinite(rms).all() and given @ rms > _SIMULATION_SHARE * accuracy
+    noisy = np.isfinite(rms).all() and not noiseless(objective, chromosome, rms)
     for _ in range(_ROUNDS if noisy else 0):
         weights = given / np.maximum(rms, max(_LEAST_SHARE * rms.max(), 1e-300))
         weighed = objective.weighed(weights)

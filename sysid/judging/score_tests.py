@@ -22,6 +22,7 @@ from typing import Self
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.fitting.free_run import noiseless
 from sysid.fitting.objective import Objective
 from sysid.judging.disturbed import DisturbedRun, of_each
 from sysid.judging.findings import Finding, moves_of
@@ -86,9 +87,8 @@ class ScoreTests:
     def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
         records = head(objective.records, _MOST_SAMPLES)
         local = sensitivity(objective.free_run.on(records), chromosome)
-        # Smaller errors than those of the simulation are these.
-        left = np.max(np.sqrt(np.mean(local.residual**2, axis=0)))
-        self._exact = bool(left < objective.simulator.accuracy)
+        left = np.sqrt(np.mean(local.residual**2, axis=0))
+        self._exact = noiseless(local.objective, chromosome, left)
         if self._exact:
             return
         self._runs = runs = _runs(local)

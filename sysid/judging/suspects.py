@@ -40,7 +40,7 @@ Kind = Literal[
 
 _PARTS = (0.5, 2.0)  # of a variant's further parameters
 _KNEE = 0.8  # share of a signal's peak from where its saturation is looked for
-_LEVELS = 8  # of a signal, below which it shows no function
+_LEVELS = 3  # of a signal, below which it shows no function
 _JUMPING = 0.05  # mean square of a signal's steps in parts of its variance, from where it jumps
 # Delays that are tested [samples]: of a large one a small one tells little where inputs jump.
 _DELAYS = (0.1, -12.0, -4.0, 4.0, 12.0)
@@ -376,8 +376,8 @@ def _moved(variant: ProcessModel, vector: FloatArray, place: int) -> Iterator[Fl
 def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """Functions of every state and input, added to every equation that parameters act in.
 
-    Inputs of a few levels show no function, but an offset. Of signals that jump from sample to
-    sample the function between them is not known.
+    Inputs of two levels show no function, but an offset. Of signals that jump from sample to
+    sample, and are not held, the function between them is not known.
     """
     model = runs[0].model
     signals: list[State | Input] = [*model.states, *model.inputs]
@@ -385,22 +385,26 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         state = model.states[i]
         for j, signal in enumerate(signals):
             together = np.concatenate([_signal(run, j) for run in runs])
-            if len(np.unique(together)) < _LEVELS or _jumps(together):
+            held = isinstance(signal, Input) and signal.hold == "zoh"
+            if len(np.unique(together)) < _LEVELS or (_jumps(together) and not held):
                 continue
             for terms in _terms(state.name, signal.name, together):
-                columns = [_added(runs, i, partial(_term_along, term, j)) for term in terms]
+                columns = [_added(runs, i, partial(_term_along, term, j, held)) for term in terms]
                 unit = f"{state.unit}/s"
                 yield Suspect("function", state.name, unit, np.stack(columns, axis=2), terms)
 
 
-def _term_along(term: AddedTerm, j: int, run: DisturbedRun) -> FloatArray:
-    return _values(term, _signal(run, j))
+def _term_along(term: AddedTerm, j: int, held: bool, run: DisturbedRun) -> FloatArray:
+    """Values (n_samples,) whose straight lines are in the mean what a held signal's steps are."""
+    values = _values(term, _signal(run, j))
+    return 0.5 * (values + np.append(values[:1], values[:-1])) if held else values
 
 
 def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[AddedTerm, ...]]:
     """Functions of a signal that are tested together.
 
-    A straight line by itself; shapes that together are like most; more friction near standstill.
+    A straight line by itself; shapes that together are like most, an even one among them; more
+    friction near standstill.
     """
     low, high = float(signal.min()), float(signal.max())
     centre = 0.0 if low < 0.0 < high else 0.5 * (low + high)
@@ -412,7 +416,8 @@ def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[AddedTe
     if size == 0.0:
         return
     yield (term("linear"),)
-    yield term("sign", _STICTION), term("square"), term("cube")
+    even = term("abs") if centre == 0.0 else term("parabola")
+    yield term("sign", _STICTION), term("square"), term("cube"), even
     if of == equation and centre == 0.0:
         yield tuple(term("stribeck", part) for part in _STANDSTILL)
 
@@ -429,7 +434,9 @@ def _values(term: AddedTerm, signal: FloatArray) -> FloatArray:
         return np.tanh(_STICTION * z / _ROUNDED)
     if term.shape == "stribeck":
         return -np.sign(z) * np.exp(-(z**2))
-    return {"linear": z, "square": z * np.abs(z), "cube": z**3}[term.shape]
+    if term.shape == "abs":
+        return np.abs(z)
+    return {"linear": z, "square": z * np.abs(z), "cube": z**3, "parabola": z**2}[term.shape]
 
 
 def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import linalg, special
 
 from sysid.arrays import FloatArray
+from sysid.fitting.free_run import noiseless
 from sysid.uncertainty.colour import record_rows
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.sensitivity import Sensitivity
@@ -27,8 +28,6 @@ _PARTS = 8  # of a single log
 _CHANCE, _CHANCE_OF_PARTS = 0.01, 1e-4
 # Share of what all logs tell of a direction above which the rest tell nothing of it.
 _ALONE = 0.98
-# Errors below this part of the simulation's accuracy are its own.
-_SIMULATION_SHARE = 0.1
 _FEWEST = 3.0  # logs, of like information, whose spread says something
 # Of a correct model's logs, that are widened a little, for all of a modest spread is not found.
 _MODEST = 0.1
@@ -88,9 +87,8 @@ def spread(
     whose directions the curvature is one. score: (n_free, n_free), its covariance by noise. None
     where the residuals are the simulation's: they are no noise that logs could differ by.
     """
-    accuracy = sensitivity.objective.simulator.accuracy
     errors = np.sqrt(np.mean(sensitivity.residual**2, axis=0))
-    if np.max(errors) < _SIMULATION_SHARE * accuracy:
+    if noiseless(sensitivity.objective, sensitivity.chromosome, errors):
         return None
     logs = len(sensitivity.lengths) > 1
     lengths = sensitivity.lengths if logs else _parts(sensitivity.lengths[0])

@@ -24,6 +24,8 @@ SHAPES = {
     "linear": lambda z: z,
     "square": lambda z: math.copysign(z * z, z),
     "cube": lambda z: z**3,
+    "abs": math.fabs,
+    "parabola": lambda z: z**2,
     "stribeck": lambda z: math.copysign(math.exp(-z * z), z),
 }
 
