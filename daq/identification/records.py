@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,16 +76,23 @@ Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for valid
 def expand(path: Path) -> list[Path]:
     """Logs named on the command line: a folder that is no capture stands for what is in it.
 
-    That is the CSV and MAT files, or else the capture folders.
+    That is the CSV and MAT files, or else the capture folders, but for those of runs that failed
+    before their second sample.
     """
     if not path.is_dir() or (path / LOG_NAME).exists():
         return [path]
     if logs := sorted((*path.glob("*.csv"), *path.glob(f"*{matlab.SUFFIX}"))):
         return logs
     if captures := sorted(log.parent for log in path.glob(f"*/{LOG_NAME}")):
-        return captures
+        return [capture for capture in captures if _begun(capture / LOG_NAME)] or captures
     problem = "neither a capture folder (with log.csv) nor a folder of CSV files or captures"
     raise ConfigError(problem, file=path)
+
+
+def _begun(log: Path) -> bool:
+    """Whether rows follow the names of its columns, two at least."""
+    with log.open("rb") as lines:
+        return len(list(islice(lines, 3))) == 3
 
 
 def load(

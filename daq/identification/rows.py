@@ -17,7 +17,7 @@ from daq.notation import percent, quantity
 
 _Z95 = 1.96
 LABELS = {  # of undetermined reasons
-    "tied": "only with others",
+    "tied": "only together",
     "vague": "hardly felt",
     "rival": "two answers",
     "": "",

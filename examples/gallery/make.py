@@ -65,12 +65,12 @@ def main():
         for file, samples, seed in zip(files, (2000, 1000), (1, 2), strict=True):
             save(module, record(module, samples, seed), file)
         result = identify(files[0], files[1], config=HERE / f"{name}.yaml")
-        table, label = result.parameters, f"[`{name}`]({name}.py)"
-        for parameter, row in table.iterrows():
-            ends = f"{row.low:.4g} .. {row.high:.4g} {row.unit}"
-            truth = f"{module.TRUTH[parameter]:.4g}"
-            lines.append(f"| {label} | `{parameter}` | {truth} | {row.value:.4g} | {ends} |")
-            hits.append(row.low <= module.TRUTH[parameter] <= row.high)
+        label = f"[`{name}`]({name}.py)"
+        for row in result.rows.parameters:
+            truth, (low, high) = module.TRUTH[row.name], row.interval
+            numbers = f"{truth:.4g} | {row.text(row.value)} | {row.span()} {row.unit}"
+            lines.append(f"| {label} | `{row.name}` | {numbers} |")
+            hits.append(low <= truth <= high)
             label = ""
         log, output = result.validation[0], module.model.outputs[-1]
         data, fit = log.log.dataset, result.metrics["fit_percent"].iloc[-1]

@@ -184,7 +184,7 @@ def test_eighty_columns_hold_what_is_listed_compared_and_refused(lab):
     assert "known are" in refused and "parameters, predictions, protocol" in refused
 
 
-def test_runs_without_samples_are_left_out_of_a_figure(lab, tmp_path):
+def test_runs_without_samples_are_left_out_of_a_figure_and_of_an_identification(lab, tmp_path):
     for capture in captures(lab):
         shutil.copytree(lab / capture, tmp_path / capture)
     log = tmp_path / captures(lab)[2] / "log.csv"
@@ -193,6 +193,11 @@ def test_runs_without_samples_are_left_out_of_a_figure(lab, tmp_path):
     assert result.returncode == 0 and "Figure: all.png" in result.stdout
     assert "its signals are not drawn: " in result.stderr
     assert (tmp_path / "all.png").exists()
+    shutil.copy(lab / "coil.py", tmp_path)
+    words = ("--model", "coil.py:coil", "--population", 10, "--generations", 5, "--json")
+    result = rig("identify", "runs", *words, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert len(json.loads(result.stdout)["metrics"]["training"]) == 2
 
 
 def test_tags_and_notes_are_put_on_runs_and_taken_away(lab):

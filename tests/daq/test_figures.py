@@ -54,7 +54,7 @@ def drawn():
             Panel(NASTY, "1", {"measured": WAVE, "identified": WAVE}),
         ]),
         "convergence": convergence(np.array([0.5, 0.2, 0.11]), 300, 0.2),
-        "ranges": ranges(["K_m", NASTY], places, ["", "only with others"]),
+        "ranges": ranges(["K_m", NASTY], places, ["", "only together"]),
         "intervals": intervals(["A alpha0", "k"], ends),
         "correlation": correlation(["K_m", NASTY], np.array([[1.0, -0.9], [-0.9, 1.0]])),
         "spectra": spectra(FREQUENCY, {"torque": np.abs(LAG) ** 2}, {"torque": "N*m"}),

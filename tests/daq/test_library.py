@@ -54,6 +54,8 @@ def test_an_identification_is_the_one_the_command_makes(recorded, found):
     told = json.loads(result.stdout)
     table = found.parameters
     assert list(table.columns) == ["value", "low", "high", "unit", "note"]
+    with pd.option_context("display.width", 80):
+        assert "..." not in repr(table)  # of 80 columns, which pandas takes in a terminal
     for name, entry in told["parameters"].items():
         assert table.loc[name, "value"] == entry["value"]
         ends = entry.get("interval") or (None, None)

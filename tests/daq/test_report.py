@@ -134,7 +134,7 @@ def test_what_they_do_not_determine_has_none_and_says_why(told):
     for name in ("a", "b"):
         entry, cells = document["parameters"][name], row(text, name)
         assert entry["undetermined"] == "tied" and not {"std", "interval"} & set(entry)
-        assert cells[2] == "-" and cells[-1].startswith("only with others")
+        assert cells[2] == "-" and cells[-1].startswith("only together")
     idle = document["parameters"]["idle"]
     assert idle["undetermined"] == "vague" and "interval" not in idle
     assert row(text, "idle")[2] == "-" and row(text, "idle")[-1].startswith("hardly felt")
