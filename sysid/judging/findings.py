@@ -89,6 +89,11 @@ _WORDS = {
     "saturation": "{name} saturates near its largest values",
     "exchange": "{name} have changed places in the log",
 }
+# What has no single amplitude.
+_SHAPES = {
+    "curve": "a curve between {name} and what is logged of it, as of a sensor that bends",
+    "disturbance": "a slow signal in d{name}/dt that nobody measured",
+}
 
 
 def description(finding: Finding) -> str:
@@ -98,8 +103,8 @@ def description(finding: Finding) -> str:
         return finding.name
     if finding.term is not None:
         return _term_text(finding.term)
-    if finding.kind == "disturbance":
-        return f"a slow signal in d{finding.name}/dt that nobody measured"
+    if finding.kind in _SHAPES:
+        return _SHAPES[finding.kind].format(name=finding.name)
     assert amplitude is not None
     if finding.kind == "change":
         change = f"{100.0 * amplitude:+.{0 if abs(amplitude) >= 0.01 else 2}f} % of its value"

@@ -31,6 +31,7 @@ from sysid.judging.suspects import (
     Suspect,
     change_suspects,
     channel_suspects,
+    curve_suspects,
     disturbance_suspects,
     function_suspects,
     head,
@@ -53,7 +54,7 @@ from sysid.uncertainty.sensitivity import (
 from sysid.uncertainty.ties import free_gradient, named_values
 
 _CHANCE = 1e-3  # probability of a finding by chance, all tests together
-_SEVERAL = ("variant", "function", "disturbance")  # have no single amplitude
+_SEVERAL = ("variant", "function", "curve", "disturbance")  # have no single amplitude
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
@@ -106,7 +107,8 @@ class ScoreTests:
         """Functions in the equations, for which there may be no need."""
         if self._exact:
             return []
-        return [*function_suspects(self._runs), *disturbance_suspects(self._runs)]
+        runs = self._runs
+        return [*function_suspects(runs), *curve_suspects(runs), *disturbance_suspects(runs)]
 
     def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
         """What the model lacks, the surest first, and how far it moves what has intervals."""

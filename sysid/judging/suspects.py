@@ -34,6 +34,7 @@ Kind = Literal[
     "noise",
     "change",
     "function",
+    "curve",
     "disturbance",
     "exchange",
 ]
@@ -437,6 +438,18 @@ def _values(term: AddedTerm, signal: FloatArray) -> FloatArray:
     if term.shape == "abs":
         return np.abs(z)
     return {"linear": z, "square": z * np.abs(z), "cube": z**3, "parabola": z**2}[term.shape]
+
+
+def curve_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """Outputs that are logged along a curve, a parabola and a cube, as of a sensor that bends."""
+    for j, output in enumerate(runs[0].model.outputs):
+        signal = np.concatenate([run.outputs[:, j] for run in runs])
+        centre, size = 0.5 * (signal.max() + signal.min()), 0.5 * np.ptp(signal)
+        if size > 0.0:
+            z = (signal - centre) / size
+            changes = np.zeros((len(z), len(runs[0].model.outputs), 2))
+            changes[:, j] = size * np.stack([z**2, z**3], axis=1)
+            yield Suspect("curve", output.name, "1", changes)
 
 
 def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:

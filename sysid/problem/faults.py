@@ -1,7 +1,7 @@
 """What is wrong with records before anything is fitted to them, and what it does to parameters."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -35,6 +35,7 @@ Role = Literal["command", "input", "sensor"]
 _COPIED = 0.5  # of a record's moving rows, beyond which it is no other record
 _STILL = 0.05  # of the motion in training, below which a record does not move
 _LONG = 10  # samples lost in a row that are many
+_STRAIGHT = 1e-9  # of an input, by which rounding bends a straight line
 _ENOUGH = 0.3  # of a record, that is worth to be fitted by itself
 _GROSS = 5.0  # of a command's deviation, beyond which a single value is no command
 _LEFT_OUT = "as 'robust: true' has it, these samples count as not measured"
@@ -315,7 +316,10 @@ class _Channel:
 
 
 def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:
-    """Rows that are missing, beside those between which outputs are measured regularly."""
+    """Rows that are missing, beside those between which outputs are measured regularly.
+
+    Where inputs were measured meanwhile, only what these samples would tell is.
+    """
     rows = np.flatnonzero(np.isfinite(record.outputs).any(axis=1))
     if len(rows) < 3:
         return
@@ -323,7 +327,8 @@ def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:
     distances = np.diff(rows)[1:]
     usual = float(np.median(distances))
     gaps = distances > 1.5 * usual
-    if not gaps.any():
+    ends = rows[1:]
+    if not gaps.any() or _inputs_go_on(record, zip(ends[:-1][gaps], ends[1:][gaps], strict=True)):
         return
     lost = distances[gaps] / usual - 1.0
     share = float(lost.sum() / (lost.sum() + len(rows)))
@@ -345,6 +350,17 @@ def _gaps(record: Dataset, part: Part) -> Iterator[DataFault]:
         "what its inputs did meanwhile is not known, and counts as if they had gone on",
         cure, share, moves_parameters=many and part == "training", settings=settings,
     )  # fmt: skip
+
+
+def _inputs_go_on(record: Dataset, gaps: Iterable[tuple[int, int]]) -> bool:
+    """Whether inputs were measured between rows, which are neither held there nor straight."""
+    for first, last in gaps:
+        part = record.inputs[first : last + 1]
+        line = np.linspace(part[0], part[-1], len(part))
+        bent = np.any(np.abs(part - line) > _STRAIGHT * np.abs(part).max(), axis=0)
+        if np.any(bent & np.any(part[:-1] != part[0], axis=0)):
+            return True
+    return False
 
 
 def _without_gaps(record: Dataset, rows: IntArray, gaps: BoolArray) -> str | None:

@@ -199,29 +199,38 @@ def test_an_output_that_never_changes_is_named():
     assert (fault.kind, fault.channel) == ("constant", "z")
 
 
+def without(record, rows):
+    """A record some rows of which were lost: its inputs count as held meanwhile."""
+    inputs, outputs = record.inputs.copy(), record.outputs.copy()
+    outputs[rows] = np.nan
+    for k in np.arange(N)[rows].tolist():
+        inputs[k] = inputs[k - 1]
+    return replace(record, inputs=inputs, outputs=outputs)
+
+
 def test_a_long_gap_is_a_doubt_and_a_short_one_is_mentioned():
     record = driven(levels())
     for length, severity in ((50, "doubt"), (2, "note")):
-        outputs = record.outputs.copy()
-        outputs[200 : 200 + length] = np.nan
-        fault = one_fault([replace(record, outputs=outputs)])
+        lost = slice(200, 200 + length)
+        fault = one_fault([without(record, lost)])
         assert (fault.kind, fault.severity) == ("gap", severity)
         assert f"{length} samples" in fault.statement
         if severity == "doubt":
             assert "'use: 2.5 s .. 9.99 s'" in fault.cure
             other = replace(driven(levels(1), seed=1), name="2", begin=100.0)
-            other.outputs[200 : 200 + length] = np.nan
-            fault = one_fault([replace(record, outputs=outputs, name="1"), other])
+            fault = one_fault([replace(without(record, lost), name="1"), without(other, lost)])
             settings = "use.1=2.5 s .. 9.99 s", "use.2=102.5 s .. 109.99 s"
             assert fault.settings == settings
 
 
 def test_gaps_everywhere_leave_no_part_to_fit():
     record = driven(levels())
-    outputs = record.outputs.copy()
-    outputs[np.arange(N) % 100 < 12] = np.nan
-    fault = one_fault([replace(record, outputs=outputs)])
+    rows = np.arange(N) % 100 < 12
+    fault = one_fault([without(record, rows)])
     assert (fault.kind, fault.severity, fault.cure) == ("gap", "doubt", "record anew")
+    # With the inputs measured meanwhile nothing is unknown.
+    outputs = np.where(rows[:, None], np.nan, record.outputs)
+    assert not data_faults(lag(), [replace(record, outputs=outputs)])
 
 
 def test_a_burst_of_interference_is_named_where_no_input_has_jumped():

@@ -105,6 +105,17 @@ def test_an_input_that_acts_through_play_is_named_with_it():
     assert finding.amplitude == pytest.approx(0.02, rel=0.15)
 
 
+def test_a_sensor_that_bends_is_named():
+    rng = np.random.default_rng(0)
+    inputs = excitation(rng)
+    outputs = Plant().run(inputs, NOISE * rng.standard_normal((len(inputs), 2)), TRUTH)[1]
+    outputs[:, 1] += 0.06 * outputs[:, 1] ** 2 / np.abs(outputs[:, 1]).max()
+    record = Dataset(inputs, outputs, DT)
+    estimator = GASSI(MODEL, population=60, generations=12).fit(record)
+    verdict = verdict_of(estimator, [record])
+    assert "a curve between omega and what is logged of it" in " ".join(verdict.parameters.reasons)
+
+
 CELL = ProcessModel(
     name="cell",
     states=(State("charge", "1", initial=1.0), State("lagging", "V")),
