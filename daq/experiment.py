@@ -154,6 +154,11 @@ class Experiment(Section, abc.ABC):
     rig: str = Field(
         "", max_length=200, description="rig file that it is for, where the command names no other"
     )
+    model: str = Field(
+        "",
+        max_length=400,
+        description="model that rig run --identify fits, where neither command nor file names one",
+    )
     sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
     calibration: OffsetCalibration = Field(OffsetCalibration(), description="offset calibration")
     homing: Homing = Field(Homing(), description="winding of the load")

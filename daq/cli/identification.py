@@ -280,9 +280,12 @@ def _show_notes(result: Identification) -> None:
         terminal.print_text(f"Criterion: {criterion['name']} ({criterion['reason']}).")
     if excerpt := result.document["search"].get("excerpt"):
         share = f"{excerpt['samples']} of {excerpt['of']} samples"
+        parts = f"{share}, in {len(excerpt['parts'])} parts"
         terminal.print_text(
-            f"Searched by {share}, in {len(excerpt['parts'])} parts, and fitted to all of them; "
-            "'search_samples: 0' searches by all."
+            f"Searched by {parts}, and fitted to all of them; 'search_samples: 0' searches by all."
+            if excerpt["fitted_to_all"]
+            else f"Fitted to {parts} with which the log is most varied; errors are those of all. "
+            "More of them ('search_samples') narrow intervals, and take as much longer."
         )
     for name, how in result.document.get("averaged", {}).items():
         terminal.print_text(f"Output {name}: {how}.")

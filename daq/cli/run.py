@@ -12,6 +12,7 @@ from daq.cli.interrupt import heeded
 
 if TYPE_CHECKING:
     from daq.identification.settings import Problem
+    from daq.lookup.experiments import LoadedExperiment
     from daq.recording.session import SessionResult
 
 
@@ -39,7 +40,7 @@ def run(
     with terminal.watching(json) as watch:
         session = open_session(experiment, rig, port, realtime, watch=watch).noting(note or [])
         # A mistake in the model must show before the rig moves.
-        problem = _problem(config, model, watch) if identify else None
+        problem = _problem(config, model, session.loaded, watch) if identify else None
         result = session.record(out, validation=identify, watch=watch)
     document = _document(result)
     if not json:
@@ -59,12 +60,32 @@ def run(
         terminal.print_json(document)
 
 
-def _problem(config: Path | None, model: str | None, watch: Any) -> Problem:
+def _problem(
+    config: Path | None, model: str | None, loaded: LoadedExperiment, watch: Any
+) -> Problem:
+    from daq.config import yaml_file
     from daq.identification.request import SettingsRequest
     from daq.identification.settings import problem_of
 
+    if model is None and (config is None or "model" not in yaml_file.load(config).content):
+        model = _intended_model(loaded)
     file = None if config is None else str(config)
     return problem_of(SettingsRequest(file, {"model": model}), watch)
+
+
+def _intended_model(loaded: LoadedExperiment) -> str | None:
+    """Whole name of the model that the experiment is for; ConfigError names file and line."""
+    from daq.errors import ConfigError
+    from daq.lookup.models import find_model, whole_name
+
+    name, file = loaded.experiment.model, loaded.file
+    if not name:
+        return None
+    try:
+        find_model(name, file.path.parent)
+    except ConfigError as error:
+        raise ConfigError.of(file.blamed(("model",), error)) from None
+    return whole_name(name, file.path.parent)
 
 
 def _identify(problem: Problem, result: SessionResult, report: bool, json: bool) -> dict[str, Any]:

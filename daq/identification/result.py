@@ -576,7 +576,10 @@ def _averaged(result: Identification) -> dict[str, str]:
 
 
 def _excerpt(result: Identification) -> dict[str, Any]:
-    """What the search of long logs went by: samples, of how many, and rows counted from 1."""
+    """What the search of long logs went by: samples, of how many, and rows counted from 1.
+
+    fitted_to_all: whether its minima were fitted to all samples then.
+    """
     excerpt = result.estimator.excerpt_
     if excerpt is None:
         return {}
@@ -586,7 +589,12 @@ def _excerpt(result: Identification) -> dict[str, Any]:
         for part in excerpt.parts
     ]
     total = sum(record.n_samples for record in excerpt.records)
-    return {"samples": excerpt.n_samples, "of": total, "parts": rows}
+    return {
+        "samples": excerpt.n_samples,
+        "of": total,
+        "fitted_to_all": not excerpt.cut,
+        "parts": rows,
+    }
 
 
 def _preparation(result: Identification) -> list[dict[str, Any]]:

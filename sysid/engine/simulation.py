@@ -118,6 +118,12 @@ class BatchSimulator:
         """The same simulations, with no more steps per sample than that, nor than before."""
         return self._like(self.accuracy, min(self.max_steps, max_steps))
 
+    def of(self, model: ProcessModel) -> BatchSimulator:
+        """The same simulations of another model."""
+        return BatchSimulator(
+            model, accuracy=self.accuracy, threads=self.threads, max_steps=self.max_steps
+        )
+
     def _like(self, accuracy: float, most: int) -> BatchSimulator:
         return BatchSimulator(self.model, accuracy=accuracy, threads=self.threads, max_steps=most)
 

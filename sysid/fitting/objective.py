@@ -153,9 +153,13 @@ class Objective:
         steps = [int(self.simulator.steps_of_each(middle, record)[0]) for record in self.records]
         return self._with(simulator=self.simulator.within(max(_FEW_STEPS, _FAR_MORE * max(steps))))
 
-    def finer(self, accuracy: float) -> Objective:
+    def finer(self, accuracy: float) -> Self:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
-        return self._with(simulator=self.simulator.finer(accuracy))
+        return self.simulated_by(self.simulator.finer(accuracy))
+
+    def simulated_by(self, simulator: BatchSimulator) -> Self:
+        """The same objective by other simulations; counts go on together."""
+        return self._with(simulator=simulator)
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
         """Error of each chromosome, (n,), infinite where its simulation failed; and the batch."""

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
@@ -24,6 +24,7 @@ from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.first_samples import noticed_starts, with_starts
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import NoisyInputs, fit_likelihood, promising
+from sysid.gassi.nudged import nudged
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
 from sysid.problem.given import Given
@@ -43,6 +44,14 @@ _OVERWHELMED = (
     "since the noise of the measured inputs would explain more than all of the free run's error: "
     "what it does adds up over this record, and only the outputs tell it"
 )
+
+# Times the samples of a search in a record, beyond which a fit goes by parts as well: more of them
+# tell little more, and take the longer.
+_VERY_LONG = 8
+
+# Minima that a search by parts does not tell apart and that are fitted to their end: to all
+# samples, or for less to the parts themselves.
+_ALIKE_BY_ALL, _ALIKE_BY_PARTS = 3, 10
 
 # Not compared with a checkpoint's: they do not decide the result, or it holds them otherwise.
 _NOT_COMPARED = ("model", "threads", "dt")
@@ -103,7 +112,8 @@ class GASSI(RecordEstimator):
     max_steps : integration steps a sample may take before a chromosome is flagged.
     search_samples : of records that have more than twice as many samples, search and descents go
         by parts of about so many, and only their minima are fitted to all; of short records that
-        repeat each other by a few of them; 0: all, always. Of the presets that refine.
+        repeat each other by a few of them. Of a record of more than eight times as many the whole
+        fit goes by parts. 0: all, always. Of the presets that refine.
     threads : default all cores; the result does not depend on their number.
     random_state : seed; equal seeds give equal results.
     dt : sample time [s] of arrays; Datasets bring their own.
@@ -114,6 +124,8 @@ class GASSI(RecordEstimator):
     vector_ : (n_parameters,), the same in the model's order.
     chromosome_ : (n_free,), the free parameters in ``space_.names`` order.
     estimated_starts_ : states whose start was estimated for the noise of their first samples.
+    final_chromosome_ : (n_free,), the same as ``final_objective`` has it, where parts of very long
+        records have starts of their own.
     initial_states_ : for each record a dict of the initial states that were estimated.
     guesses_ : {name: Guess} of the ranges that were read from the records.
     space_ : SearchSpace that was searched; estimated initial states stand behind the parameters.
@@ -130,7 +142,8 @@ class GASSI(RecordEstimator):
     history_ : (n_generations,), the best error after each ``population`` simulations.
     stopped_ : ``generations``, ``converged`` or ``interrupted``.
     flagged_ : {status name: count} of simulations that failed during the search.
-    excerpt_ : the ``Excerpt`` of long records that the search went by, None where it was all.
+    excerpt_ : the ``Excerpt`` of long records that the search went by, and the fit as well where
+        it is ``cut``; None where it was all.
     n_simulations_ : simulations of one chromosome on all records, or on the excerpt.
 
     Examples
@@ -235,10 +248,8 @@ class GASSI(RecordEstimator):
         self.criterion_, self.criterion_reason_ = self._criterion(data, preset)
         self.output_noise_: FloatArray | None = None
         self.averaged_inputs_ = False
-        self.excerpt_ = Excerpt.of(data, self.search_samples) if preset.refine else None
-        searched = objective
-        if self.excerpt_ is not None:
-            searched = objective.on(self.excerpt_.datasets(), self.excerpt_.places)
+        self.excerpt_ = self._excerpt(data) if preset.refine else None
+        searched, objective = self._searched(objective), self._of_parts(objective)
         begin = begin if preset.refine else None
         run = self._search_run(searched, preset, begin)
         checkpoints = self._checkpoints(data, run, checkpoint, resume)
@@ -293,7 +304,7 @@ class GASSI(RecordEstimator):
 
         searched, excerpt, weighs = run.objective, self.excerpt_, self.criterion_ != "error"
         if excerpt is not None:
-            space, (chromosome,) = excerpt.on_all(searched.space, [self.chromosome_])
+            space, (chromosome,) = self._on_fitted(run, objective, [self.final_chromosome_])
             objective = objective.over(space)
             self._set_evaluated(objective, chromosome)
         if self.stopped_ == "interrupted" or not self._preset().refine:
@@ -303,13 +314,18 @@ class GASSI(RecordEstimator):
                 self._maximise_likelihood(searched, run.minima(), watch, settled=settled)
             return
         if weighs:
+            minima = run.minima()
+            if excerpt.cut:
+                searched, minima = objective, self._on_fitted(run, objective, minima)[1]
             # What looks like a filter's minimum it tells itself, by all of the records.
             lookalike = not settled and self.criterion_ != "innovations"
-            minima = promising(searched, run.minima(), watch, lookalike=lookalike)
-            minima = excerpt.on_all(searched.space, minima)[1]
+            most = _ALIKE_BY_PARTS if excerpt.cut else _ALIKE_BY_ALL
+            minima = promising(searched, minima, watch, lookalike=lookalike, most=most)
+            if not excerpt.cut:
+                minima = excerpt.on_all(searched.space, minima)[1]
             self._maximise_likelihood(objective, minima, watch, explored=True, settled=settled)
             return
-        minima = excerpt.on_all(searched.space, run.minima())[1]
+        minima = self._on_fitted(run, objective, run.minima())[1]
         ends = refine_each(objective, [begin(objective, minimum) for minimum in minima])
         best = min(ends, key=lambda end: (not space.feasible(end.chromosome), end.error))
         self._set_evaluated(objective, best.chromosome)
@@ -355,8 +371,7 @@ class GASSI(RecordEstimator):
         model, before = self._model(), objective.space
         started = [with_starts(model, objective.records, before, c) for c in chromosomes]
         self.space_ = started[0][0]
-        anew = self._objective(objective.records)
-        anew.resume_count(objective.simulations)
+        anew = objective.simulated_by(self.simulator()).over(self.space_)
         self._set_evaluated(anew, started[0][1])
         return anew, [chromosome for _, chromosome in started]
 
@@ -396,7 +411,11 @@ class GASSI(RecordEstimator):
         X, y, records: those of ``fit``. Raises ModelError unless refinement ended in a minimum.
         """
         objective = self.final_objective(X, y, records)
-        return uncertainty(objective, self.chromosome_, self._rivals, self._ridge)
+        minima = self.final_chromosome_, self._rivals, self._ridge
+        if self.excerpt_ is None or not self.excerpt_.cut:
+            return uncertainty(objective, *minima)
+        places = self.excerpt_.places_on_all(objective.space)
+        return uncertainty(objective, *minima, profiled=places).of(places, self.space_.names)
 
     @one_thread()
     def determined_rank(self, X: Data, y: FloatArray | None = None, *, records: Any = None) -> int:
@@ -405,7 +424,7 @@ class GASSI(RecordEstimator):
         That of ``uncertainty``, without its intervals, which take far longer. X, y, records: those
         of ``fit``. Raises ModelError as ``uncertainty``.
         """
-        return determined_rank(self.final_objective(X, y, records), self.chromosome_)
+        return determined_rank(self.final_objective(X, y, records), self.final_chromosome_)
 
     @one_thread()
     def profile(
@@ -416,7 +435,7 @@ class GASSI(RecordEstimator):
         X, y, records: those of ``fit``. Raises ModelError as ``uncertainty``, and for a parameter
         that is not free.
         """
-        return profile(self.final_objective(X, y, records), self.chromosome_, name)
+        return profile(self.final_objective(X, y, records), self.final_chromosome_, name)
 
     @property
     def rivals_(self) -> list[dict[str, float]]:
@@ -432,7 +451,7 @@ class GASSI(RecordEstimator):
         """
         fitted = self._fitted_objective(X, y, records)
         if isinstance(fitted, Innovations):
-            return fitted.doubting(self.chromosome_).eased(self.chromosome_)
+            return fitted.doubting(self.final_chromosome_).eased(self.final_chromosome_)
         return fitted
 
     def final_free_run(
@@ -451,7 +470,10 @@ class GASSI(RecordEstimator):
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        objective = self._at_final_accuracy(self._objective(data).weighed(self.output_weights_))
+        objective = self._of_parts(self._objective(data)).weighed(self.output_weights_)
+        objective = self._at_final_accuracy(objective)
+        if objective.records is not data and self.space_.estimated:
+            objective = objective.over(self.space_.without_starts().with_starts(objective.records))
         if self.output_noise_ is None:
             return objective
         return Innovations.of(
@@ -460,7 +482,7 @@ class GASSI(RecordEstimator):
             corrects=self.criterion_ == "innovations",
             process=self._process(),
             quiet=self.averaged_inputs_,
-            near=self.chromosome_,
+            near=self.final_chromosome_,
         )
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
@@ -488,6 +510,40 @@ class GASSI(RecordEstimator):
             weights=self._weights(),
             given=self.given.changes(self._model()) if self.given else None,
         )
+
+    def _excerpt(self, records: Sequence[Dataset]) -> Excerpt | None:
+        """The parts that a search of long records goes by, and a fit of very long ones."""
+        excerpt = Excerpt.of(records, self.search_samples)
+        longest = max(record.n_samples for record in records)
+        if excerpt is None or longest <= _VERY_LONG * self.search_samples:
+            return excerpt
+        return replace(excerpt, cut=True)
+
+    def _of_parts(self, objective: Objective) -> Objective:
+        """An objective of the records as that of what the fit goes by."""
+        excerpt = self.excerpt_
+        return objective if excerpt is None or not excerpt.cut else excerpt.among(objective)
+
+    def _searched(self, objective: Objective) -> Objective:
+        """An objective of the records as that of what the search goes by."""
+        excerpt, held = self.excerpt_, None
+        if excerpt is not None and excerpt.cut:
+            held = nudged(objective.simulator, excerpt)
+        if held is not None:
+            simulator, excerpt = held
+            objective = objective.simulated_by(simulator)
+        return objective if excerpt is None else excerpt.among(objective)
+
+    def _on_fitted(
+        self, run: SearchRun, objective: Objective, chromosomes: Sequence[FloatArray]
+    ) -> tuple[SearchSpace, list[FloatArray]]:
+        """Space and chromosomes (n_free,) of a search as those of what the fit goes by."""
+        excerpt, space = self.excerpt_, run.objective.space
+        assert excerpt is not None
+        if not excerpt.cut:
+            return excerpt.on_all(space, chromosomes)
+        begun = [with_starts(self._model(), objective.records, space, c) for c in chromosomes]
+        return begun[0][0], [chromosome for _, chromosome in begun]
 
     def _model(self) -> ProcessModel:
         if self.model is None:
@@ -646,7 +702,11 @@ class GASSI(RecordEstimator):
         self.n_simulations_ = objective.simulations
 
     def _set_best(self, best: Best) -> None:
-        self.space_, self.chromosome_, self.error_, self.feasible_ = best
+        space, chromosome, self.error_, self.feasible_ = best
+        self.final_chromosome_: FloatArray = chromosome
+        if self.excerpt_ is not None and self.excerpt_.cut:
+            space, (chromosome,) = self.excerpt_.on_all(space, [chromosome])
+        self.space_, self.chromosome_ = space, chromosome
         self.vector_ = self.space_.full(self.chromosome_)
         self.parameters_ = self._named(self.vector_)
         self.initial_states_ = self.space_.named_starts(self.chromosome_)

@@ -42,10 +42,14 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Excerpt:
-    """Parts of some records, those of each in order of time and the first from its first row."""
+    """Parts of some records, those of each in order of time and the first from its first row.
+
+    cut: whether a fit goes by nothing else, so that parts are records ``cut`` from others.
+    """
 
     records: Sequence[Dataset]
     parts: tuple[Part, ...]
+    cut: bool = False
 
     @classmethod
     def of(cls, records: Sequence[Dataset], samples: int, *, every: bool = True) -> Excerpt | None:
@@ -95,11 +99,15 @@ class Excerpt:
             return part
         outputs = part.outputs.copy()
         outputs[1 : int(_RUN_IN * len(outputs))] = np.nan
-        return replace(part, outputs=outputs)
+        return replace(part, outputs=outputs, cut=self.cut)
+
+    def among(self, objective: Objective) -> Objective:
+        """An objective of the records as that of the parts, over the same space."""
+        return objective.on(self.datasets(), self.places)
 
     def of_all(self, objective: Objective) -> Objective:
         """An objective of the records as that of the parts."""
-        part = objective.on(self.datasets(), self.places)
+        part = self.among(objective)
         return part.over(objective.space.without_starts().with_starts(part.records))
 
     def on_parts(
@@ -117,6 +125,12 @@ class Excerpt:
                 on_parts[n + j] = starts[self.parts[k].place, state]
         low, high = np.array([(p.lower, p.upper) for p in part_space.parameters]).T
         return np.clip(on_parts, low, high)
+
+    def places_on_all(self, space: SearchSpace) -> list[int]:
+        """Which coordinates of the parts (n_free,) those of the records are, in order."""
+        n = len(space.index)
+        heads = [j for j, (k, _) in enumerate(space.estimated) if self.parts[k].begin == 0]
+        return [*range(n), *(n + j for j in heads)]
 
     def on_all(
         self, space: SearchSpace, chromosomes: Sequence[FloatArray]

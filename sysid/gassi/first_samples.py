@@ -28,8 +28,11 @@ def noticed_starts(
     kept: names of states that start there all the same.
     """
     local, names = sensitivity(objective, chromosome), objective.simulator.model.state_names
-    noise = np.sqrt(np.mean(local.residual**2, axis=0))
-    noise = np.where(noise > 0.0, noise, np.inf)
+    # An output that is explained too well to decide counts as if by more noise than it has.
+    rms = np.sqrt(np.mean(local.residual**2, axis=0))
+    counting = np.sqrt(objective.least_squares_weights(local.residual)) * (rms > 0.0)
+    noise = np.full_like(rms, np.inf)
+    np.divide((rms * counting).max(), counting, out=noise, where=counting > 0.0)
     made_up_for = directions(local.slopes / noise[:, None])
     squares = np.zeros(len(names))
     for state, change in start_errors(local):

@@ -50,7 +50,6 @@ _TOLD_APART = 13.3
 # deeper varies by twice the root of how far apart they are, more than within either.
 _ALIKE = 6.63
 _CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
-_MOST_PROMISING = 3  # minima of a part of the data that are fitted to all
 _QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
 _MOVING = 2.0  # deviations that errors of the integration may make on an excerpt
 _AT_ONCE = 8  # descents side by side, which later ones need not repeat
@@ -150,17 +149,18 @@ def promising(
     minima: Sequence[FloatArray],
     watch: Watch | None = None,
     *,
+    most: int,
     lookalike: bool = True,
 ) -> list[FloatArray]:
     """Of some minima (n_free,), and perhaps their lookalikes, those that more data may favour.
 
-    At most three, the best first; where they are is known roughly, for they are meant to be fitted
-    to all data.
+    The best first; where they are is known roughly, for they are meant to be fitted to their end,
+    as many as that is affordable for.
     """
     optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=True)
     best, *others = optima.ranked()
     near = [rival for rival in others if optima.deviance(rival, best) < _TOLD_APART]
-    return [optimum.chromosome for optimum in (best, *near)[:_MOST_PROMISING]]
+    return [optimum.chromosome for optimum in (best, *near)[:most]]
 
 
 def _slid(optimum: Optimum) -> Optimum:

@@ -110,7 +110,7 @@ def suspected(
         tested = uncertainty
         if any(p.pushed for p in uncertainty.parameters):
             # What an end of a range leaves looks like something missing.
-            freed = _freed(estimator.final_objective(list(training)), estimator.chromosome_)
+            freed = _freed(estimator.final_objective(list(training)), estimator.final_chromosome_)
             tested = intervals(*freed)
             findings = missing_physics(*freed, tested)
         else:
@@ -133,7 +133,7 @@ def score_tests_of(estimator: GASSI, training: Sequence[Dataset]) -> ScoreTests:
 
     Raises ModelError for equations that cannot be added to, and a run that fails.
     """
-    return ScoreTests(estimator.final_free_run(list(training)), estimator.chromosome_)
+    return ScoreTests(estimator.final_free_run(list(training)), estimator.final_chromosome_)
 
 
 def _freed(objective: Objective, chromosome: FloatArray) -> tuple[Objective, FloatArray]:

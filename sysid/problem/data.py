@@ -28,7 +28,8 @@ class Dataset:
     (n_samples, n_outputs), standard deviation of when each window was [s]. between: (n_samples,
     n_inputs), by how much the mean of an interpolated input up to the next sample differs from that
     of a straight line, for which filters bend it. Default none. begin: instant of the first row as
-    whoever made the record counts time [s].
+    whoever made the record counts time [s]. cut: whether it was cut from a longer record amid its
+    motion, so that states whose first sample is a mean over the time before start elsewhere.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -50,6 +51,7 @@ class Dataset:
     jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
     between: FloatArray = field(default_factory=lambda: np.zeros(0))
     begin: float = 0.0
+    cut: bool = False
 
     def __repr__(self) -> str:
         size = f"{self.n_samples} samples, dt={self.dt:g} s"
@@ -200,6 +202,8 @@ class Dataset:
     def initial_range(self, model: ProcessModel, state: int) -> tuple[float, float] | None:
         """Range in which a state's initial value is estimated; None where it is not."""
         declared = model.states[state].initial_range
+        if declared is None and self.cut and self._averaged_at_first(model, state):
+            declared = AROUND_FIRST_SAMPLE
         if declared != AROUND_FIRST_SAMPLE:
             return declared
         values = self.outputs[:, model.output_names.index(model.state_names[state])]
@@ -207,6 +211,15 @@ class Dataset:
         middle = float(self.initial_state(model)[state])
         span = (float(np.ptp(values)) if len(values) else 0.0) or 1.0
         return middle - span, middle + span
+
+    def _averaged_at_first(self, model: ProcessModel, state: int) -> bool:
+        """Whether the first sample of a state is a mean over a window before it."""
+        name = model.state_names[state]
+        if name not in model.output_names or not self.windows.size:
+            return False
+        j = model.output_names.index(name)
+        begin, end = self.windows[0, j]
+        return bool(np.isfinite(self.outputs[0, j]) and begin < end)
 
 
 def require_information(datasets: list[Dataset], names: Sequence[str], n_free: int) -> None:

@@ -106,6 +106,35 @@ class Uncertainty:
             correlation: FloatArray = self.covariance / np.outer(deviation, deviation)
         return correlation
 
+    def of(self, places: Sequence[int], names: Sequence[str]) -> Self:
+        """The same of some of the coordinates, under other names."""
+        renamed = {
+            self.parameters[place].name: name for place, name in zip(places, names, strict=True)
+        }
+        return replace(
+            self,
+            parameters=tuple(
+                replace(self.parameters[j], name=renamed[self.parameters[j].name]) for j in places
+            ),
+            ambiguities=tuple(
+                replace(
+                    a,
+                    parameters=tuple(renamed[n] for n in a.parameters if n in renamed),
+                    measure=tuple(renamed[n] for n in a.measure if n in renamed),
+                )
+                for a in self.ambiguities
+            ),
+            covariance=self.covariance[np.ix_(places, places)],
+            rivals=tuple(
+                Rival(
+                    {renamed[n]: value for n, value in rival.values.items() if n in renamed},
+                    {renamed[n]: ends for n, ends in rival.intervals.items() if n in renamed},
+                )
+                for rival in self.rivals
+            ),
+            factor=self.factor[:, places] if self.factor.size else self.factor,
+        )
+
     def determined(self) -> tuple[Estimate, ...]:
         """All quantities with an interval: parameters, then combinations."""
         combined = itertools.chain(*(a.determined for a in self.ambiguities))
@@ -118,28 +147,33 @@ def uncertainty(
     rivals: Sequence[FloatArray] = (),
     ridge: Sequence[FloatArray] = (),
     structure: Ties | None = None,
+    profiled: Sequence[int] | None = None,
 ) -> Uncertainty:
     """Intervals, ambiguities and what is determined at an identified chromosome, (n_free,).
 
     The estimate is taken as the minimum of the objective; the colour of its residuals and the
     records' zero errors enter the covariance. rivals: other minima that explain the data as well.
     ridge: further points of the valley that the chromosome lies in. structure: what the equations
-    leave undetermined, by default what the model's do.
+    leave undetermined, by default what the model's do. profiled: coordinates whose profiles are
+    traced where slopes are no guide, default all.
     """
     local = sensitivity(objective, chromosome)
     analysis = _Analysis(local, structure or ties(local), ridge)
     bottoms = [_Analysis(sensitivity(objective, point), analysis.ties) for point in ridge]
     others = list(analysis.unlike(rivals))
-    minima = [analysis.rival(rival) for rival in others]
-    places = [named_values(analysis.space, rival) for rival in others]
-
-    def disputed(estimate: Estimate) -> bool:
-        return not estimate.why and any(estimate.excludes(place) for place in places)
+    apart = [_Analysis(sensitivity(objective, rival), analysis.ties) for rival in others]
+    minima = [rival.as_rival() for rival in apart]
 
     def judged(estimate: Estimate) -> Estimate:
-        return replace(estimate, why="rival") if disputed(estimate) else estimate
+        if estimate.why or not any(estimate.excludes(rival.named) for rival in apart):
+            return estimate
+        if all(_overlap(estimate, rival.by_slopes(estimate)) for rival in apart):
+            return _with_bottoms(estimate, apart)
+        return replace(estimate, why="rival")
 
     drafts = [analysis.parameter(j) for j in range(len(chromosome))]
+    if profiled is not None:
+        drafts = [d if j in profiled else replace(d, tracer=None) for j, d in enumerate(drafts)]
     tied = list(analysis.ambiguities())
     combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
     settled = analysis.settled([*drafts, *combined])
@@ -150,10 +184,10 @@ def uncertainty(
         replace(ambiguity, determined=tuple(itertools.islice(estimates, len(combinations))))
         for ambiguity, combinations in tied
     ]
-    apart = [e for e in parameters if e.why == "rival"]
-    apart.sort(key=lambda e: measuring_effort(e.unit))
-    if apart:
-        names = tuple(e.name for e in apart)
+    disputed = [e for e in parameters if e.why == "rival"]
+    disputed.sort(key=lambda e: measuring_effort(e.unit))
+    if disputed:
+        names = tuple(e.name for e in disputed)
         ambiguities.insert(0, Ambiguity("rival", names, (), names[:1]))
     spread = analysis.covariance.spread
     result = Uncertainty(
@@ -162,7 +196,7 @@ def uncertainty(
         analysis.reported_covariance(parameters),
         analysis.covariance.singular_values,
         analysis.covariance.rank,
-        tuple(rival for rival in minima if any(e.excludes(rival.values) for e in apart)),
+        tuple(rival for rival in minima if any(e.excludes(rival.values) for e in disputed)),
         disagreement=spread.disagreement if spread else 1.0,
         factor=analysis.factor(
             others, itertools.chain(parameters, *(a.determined for a in ambiguities)), bottoms
@@ -189,6 +223,14 @@ def _with_bottoms(estimate: Estimate, bottoms: Sequence["_Analysis"]) -> Estimat
     if estimate.low - low <= most and high - estimate.high <= most:
         return estimate
     return replace(estimate, std=None, low=low, high=high)
+
+
+def _overlap(estimate: Estimate, rival: Estimate) -> bool:
+    """Whether an interval has values in common with that around another minimum."""
+    if rival.std is None or rival.low is None or rival.high is None:
+        return False
+    below = estimate.high is not None and estimate.high < rival.low
+    return not below and (estimate.low is None or rival.high >= estimate.low)
 
 
 def determined_rank(objective: Objective, chromosome: FloatArray) -> int:
@@ -413,18 +455,16 @@ class _Analysis:
                 kept.append(chromosome)
         return kept
 
-    def rival(self, chromosome: FloatArray) -> Rival:
-        """Another minimum, with intervals by the covariance there."""
-        local, intervals = sensitivity(self.objective, chromosome), {}
-        spread = covariance(local, self.ties.directions)
+    def as_rival(self) -> Rival:
+        """This minimum as another, with intervals by the covariance here."""
+        intervals = {}
         for j, name in enumerate(self.space.names):
-            at = float(self.space.encode(chromosome)[j])
-            deviation = spread.deviation(np.eye(len(chromosome))[j])
+            deviation = self.free.deviation(np.eye(len(self.coded))[j])
             if not self.ties.bound[j] and np.isfinite(deviation):
-                ends = [at + sign * Z95 * deviation for sign in _SIDES]
+                ends = [float(self.coded[j]) + sign * Z95 * deviation for sign in _SIDES]
                 low, high = np.clip(ends, *(bounds[j] for bounds in self.space.coded_bounds))
                 intervals[name] = self._decoded(j, low), self._decoded(j, high)
-        return Rival(dict(zip(self.space.names, chromosome.tolist(), strict=True)), intervals)
+        return Rival(dict(zip(self.space.names, self.chromosome.tolist(), strict=True)), intervals)
 
     def reported_covariance(self, parameters: Sequence[Estimate]) -> FloatArray:
         """Covariance (n_free, n_free) of the parameters that have an interval, else zero."""

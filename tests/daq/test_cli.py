@@ -81,7 +81,9 @@ def test_the_installed_command_is_the_module(tmp_path):
 
 @pytest.mark.soak
 def test_json_of_a_run_with_identification_is_one_document(tmp_path):
-    write_experiment(tmp_path / "e.yaml", duration=0.2, validation={"motor": {"seed": 77}})
+    model = "actuator:friction=none"
+    validation = {"motor": {"seed": 77}}
+    write_experiment(tmp_path / "e.yaml", duration=0.2, validation=validation, model=model)
     write_yaml(tmp_path / "id.yaml", few_free())
     result = rig("run", "e.yaml", "--identify", "--config", "id.yaml", "--json", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -89,6 +91,7 @@ def test_json_of_a_run_with_identification_is_one_document(tmp_path):
     assert document["run"]["samples"] == document["validation"]["samples"] == 160
     assert document["run"]["folder"] != document["validation"]["folder"]
     found = document["identification"]
+    assert found["model"] == model
     assert len(found["parameters"]) == 21 and found["search"]["generations"] == 2
     assert len(found["metrics"]["training"]) == len(found["metrics"]["validation"]) == 1
     assert (tmp_path / found["files"]["parameters"]).exists()

@@ -8,9 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sysid import GASSI, BatchSimulator, Dataset, Output, Parameter, State
+from sysid import GASSI, BatchSimulator, Dataset, Input, Output, Parameter, State
 from sysid.fitting.objective import Objective
 from sysid.gassi.excerpt import Excerpt
+from sysid.gassi.nudged import nudged
 from sysid.problem.space import SearchSpace
 from tests.sysid.support import lag, prbs
 
@@ -172,3 +173,73 @@ def test_of_short_records_that_repeat_each_other_a_few_are_enough():
     assert Excerpt.of(records, 0) is None
     for size in (0.1, 10.0):
         assert Excerpt.of([*records, repeated(size)], 8192) is None
+
+
+def swing_derivative(x, u, p):
+    return (x[1], p[0] * p[0] * (u[0] - x[0]) - p[1] * x[1])
+
+
+def swing():
+    """A pendulum whose free run of the wrong frequency is out of step after a few swings."""
+    return lag(
+        states=(State("angle", "rad"), State("rate", "rad/s", initial_range=(-50.0, 50.0))),
+        inputs=(Input("u", "rad"),),
+        outputs=(Output("angle", "rad"),),
+        parameters=(
+            Parameter("frequency", "rad/s", 8.0, 2.0, 60.0, "log"),
+            Parameter("damping", "1/s", 0.2, 0.02, 2.0, "log"),
+        ),
+        derivative=swing_derivative,
+    )
+
+
+SWINGING = np.array([23.0, 0.3])
+
+
+@pytest.fixture(scope="module")
+def very_long_record():
+    rng, n = np.random.default_rng(1), 40_000
+    inputs = np.repeat(rng.uniform(-1.0, 1.0, n // 400), 400)[:, None]
+    blank = Dataset(inputs, np.full((n, 1), np.nan), 0.01)
+    outputs = BatchSimulator(swing(), accuracy=1e-6).trajectories(SWINGING, blank)[0]
+    return Dataset(inputs, outputs + 1e-4 * rng.standard_normal((n, 1)), 0.01)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_very_long_record_is_fitted_by_parts_however_it_swings(very_long_record, seed):
+    estimator = GASSI(swing(), search_samples=4096, random_state=seed, **SETTINGS)
+    estimator.fit(very_long_record)
+    assert estimator.excerpt_.cut and estimator.excerpt_.n_samples == 4096
+    assert estimator.vector_ == pytest.approx(SWINGING, rel=1e-4)
+    # Precise enough an angle's start is estimated; each only where the record begins.
+    assert estimator.space_.names == ("frequency", "damping", "angle(0)", "rate(0)")
+    assert estimator.initial_states_ == [pytest.approx({"angle": 0.0, "rate": 0.0}, abs=1e-3)]
+    found = estimator.uncertainty(very_long_record)
+    assert tuple(estimate.name for estimate in found.parameters) == estimator.space_.names
+    for estimate, truth in zip(found.parameters, [*SWINGING, 0.0, 0.0], strict=True):
+        assert estimate.low < truth < estimate.high
+    assert found.covariance.shape == (4, 4) and found.factor.shape[1] == 4
+    free = BatchSimulator(swing()).trajectories(estimator.vector_, very_long_record)[0]
+    assert np.std(free - very_long_record.outputs) == pytest.approx(1e-4, rel=0.05)
+
+
+def test_what_is_measured_with_noise_is_not_held_to_it(very_long_record):
+    rng, simulator = np.random.default_rng(2), BatchSimulator(swing())
+    noise = 0.2 * rng.standard_normal(very_long_record.outputs.shape)
+    noisy = replace(very_long_record, outputs=very_long_record.outputs + noise)
+    calibrated = replace(very_long_record, output_noise=np.array([0.01]))
+    held, driven = nudged(simulator, Excerpt.of([very_long_record], 4096))
+    assert len(held.model.inputs) == 2 and driven.records[0].inputs.shape[1] == 2
+    for record in (noisy, calibrated):
+        assert nudged(simulator, Excerpt.of([record], 4096)) is None
+
+
+def test_a_part_whose_speed_is_a_mean_before_it_starts_as_the_fit_wants():
+    record = staircase()
+    windows = np.zeros((*record.outputs.shape, 2))
+    windows[..., 0] = -0.01
+    record, model = replace(record, windows=windows), lag()
+    excerpt = replace(Excerpt.of([record], 2048), cut=True)
+    plain = SearchSpace.of(model)
+    assert plain.with_starts(excerpt.datasets()).names == ("gain", "tau", "y(0) 2")
+    assert plain.with_starts(replace(excerpt, cut=False).datasets()).names == ("gain", "tau")
