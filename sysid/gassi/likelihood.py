@@ -12,13 +12,13 @@ its errors leaves; those that it cannot tell apart are rivals.
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Literal, Self
+from functools import partial
+from typing import Literal
 
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.fitting.descent import TOLERANCE, Point, Restriction
+from sysid.fitting.descent import TOLERANCE, Point
 from sysid.fitting.free_run import accurate, fine_enough, noiseless
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
@@ -26,54 +26,38 @@ from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine,
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, by_filter, coloured
 from sysid.gassi.lookalikes import lookalikes
+from sysid.gassi.optima import (
+    LEAST_SHARE,
+    QUICKLY,
+    ROUGHLY,
+    TINY,
+    TOLD_APART,
+    Optima,
+    Optimum,
+    chromosomes_of,
+    to_compare,
+)
 from sysid.gassi.slide import slid
-from sysid.uncertainty.colour import colour, longest_memory
 from sysid.uncertainty.estimate import Z95
-from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
-from sysid.uncertainty.ties import Shown, ties
 
 _ROUNDS = 6  # of weights and parameters in turn
 _NOISE_ROUNDS = 20  # the same of noise, weights and parameters
 _STEADY = 1e-3  # share by which weights may still change
 _RENEWED = 0.05  # change of a noise, where all else has come to rest, by which a fit goes on
 _SWINGING = -0.5  # a round's change of a noise's logarithm in parts of the one before
-# An output explained much better than the others keeps this share of the largest error, or the
-# arithmetic of its last digits would decide.
-_LEAST_SHARE = 1e-2
-_TINY = 1e-300
-# Colour does not make an output's errors count as fewer independent samples than this.
-_FEWEST = 30.0
-# Deviance above which one minimum is no rival to another: one in a hundred for the four
-# parameters in which such minima typically differ.
-_TOLD_APART = 13.3
-# The same for two bottoms of one valley, where chance has but one direction: which of two is the
-# deeper varies by twice the root of how far apart they are, more than within either.
+# Deviance above which a further bottom of one valley does not count, where chance has but one
+# direction: which of two is the deeper varies by twice the root of how far apart they are, more
+# than within either.
 _ALIKE = 6.63
-_CONCEIVABLE = 40.0  # the same before a minimum has been refined to its end
-_QUICKLY, _ROUGHLY = 15, 1e-4  # iterations and tolerance until then
+_CONCEIVABLE = 40.0  # the same of a minimum that has not been refined to its end
 _MOVING = 2.0  # deviations that errors of the integration may make on an excerpt
 _AT_ONCE = 8  # descents side by side, which later ones need not repeat
-_WAY = np.array([0.25, 0.5, 0.75])  # parts of the way between two minima that are tried
-_SLACK = 1e-10  # of the most that is told, which is told of every coordinate
 _EXPLORED = 2  # minima whose lookalikes are descended from
 _EXPLORED_BY_FILTER = 5  # the same by a filter
 _BETTER = Z95**2  # deviance by which one of them has to be better than the one before
-# Minima are one when the way between them, were all linear, changed twice the log-likelihood by
-# less than this.
-_ONE = 16.0
 
 Watch = Callable[[Point], None]
 NoisyInputs = Literal["compensated", "innovations"]
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """A minimum by its own weights: chromosome (n_free,), the outputs' errors (n_outputs,)."""
-
-    objective: Objective
-    chromosome: FloatArray
-    rms: FloatArray
-    feasible: bool
 
 
 @dataclass(frozen=True)
@@ -123,12 +107,12 @@ def fit_likelihood(
     if refitted is not None:
         optima = refitted
         best, *others = optima.ranked()
-    rivals = [optimum for optimum in others if optima.deviance(optimum, best) < _TOLD_APART]
+    rivals = [optimum for optimum in others if optima.deviance(optimum, best) < TOLD_APART]
     connected = optima.connected(best, rivals)
     apart = list(itertools.compress(rivals, np.logical_not(connected)))
     valley = itertools.compress(rivals, connected)
     ridge = [rival for rival in valley if optima.deviance(rival, best) < _ALIKE]
-    return Likeliest(_slid(_resting(best)), _chromosomes(apart), _chromosomes(ridge))
+    return Likeliest(_slid(_resting(best)), chromosomes_of(apart), chromosomes_of(ridge))
 
 
 def _resting(best: Optimum) -> Optimum:
@@ -141,7 +125,7 @@ def _resting(best: Optimum) -> Optimum:
         return best
     settled = finer.renewed(best.chromosome)
     end = refine(settled, best.chromosome)
-    return _optimum(settled, end.chromosome, end.rms)
+    return Optimum.of(settled, end.chromosome, end.rms)
 
 
 def promising(
@@ -159,151 +143,14 @@ def promising(
     """
     optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=True)
     best, *others = optima.ranked()
-    near = [rival for rival in others if optima.deviance(rival, best) < _TOLD_APART]
+    near = [rival for rival in others if optima.deviance(rival, best) < TOLD_APART]
     return [optimum.chromosome for optimum in (best, *near)[:most]]
 
 
 def _slid(optimum: Optimum) -> Optimum:
     objective = optimum.objective
     end = slid(objective, optimum.chromosome)
-    return optimum if end is None else _optimum(objective, end.chromosome, end.rms)
-
-
-def _chromosomes(optima: Sequence[Optimum]) -> tuple[FloatArray, ...]:
-    return tuple(optimum.chromosome for optimum in optima)
-
-
-class _Optima:
-    """Minima far from each other, compared by what the data tell at the first.
-
-    scale: errors of the outputs (n_outputs,) that are alike to start from.
-    """
-
-    def __init__(self, objective: Objective, scale: FloatArray | float = 1.0) -> None:
-        self._objective, self._scale = objective, np.maximum(scale, _TINY)
-        self._optima: list[Optimum] = []
-
-    @classmethod
-    def around(cls, first: Optimum, objective: Objective, too_well: FloatArray) -> Self:
-        """One refitted for noisy inputs; too_well: (n_outputs,), as of ``_too_well``."""
-        optima = cls(objective, first.rms * too_well)
-        optima.add(first)
-        return optima
-
-    def add(self, optimum: Optimum) -> None:
-        """Add a minimum if it is a new one."""
-        if self.new(optimum.chromosome):
-            self._optima.append(optimum)
-
-    def new(self, chromosome: FloatArray, others: Sequence[FloatArray] = ()) -> bool:
-        """Whether a chromosome is far from all minima, and others, where the data feel it.
-
-        Along ties it is no other minimum, however far.
-        """
-        minima = [*_chromosomes(self._optima), *others]
-        if not minima:
-            return True
-        at, *ends = map(self._shown.coordinates, [chromosome, *minima])
-        moves = np.array(ends) - at
-        return not np.any(np.sum((moves @ self._information) * moves, axis=1) < _ONE)
-
-    def refit(self, optimum: Optimum, refitted: Optimum | None) -> None:
-        """Put one fitted by its own noise, if it could be, in the place of a minimum."""
-        if refitted is not None:
-            rms = _exactly(optimum.objective).rms(refitted.chromosome[None])[0]
-            place = [kept is optimum for kept in self._optima].index(True)
-            self._optima[place] = _optimum(refitted.objective, refitted.chromosome, rms)
-
-    def ranked(self) -> list[Optimum]:
-        """The likeliest first, feasible before infeasible."""
-        first = self._optima[0]
-        return sorted(self._optima, key=lambda o: (not o.feasible, self.deviance(o, first)))
-
-    def deviance(self, optimum: Optimum, reference: Optimum) -> float:
-        """Twice the logarithm of the likelihood ratio of the reference and the optimum."""
-        return self._deviance(optimum.rms, reference.rms)
-
-    def _deviance(self, rms: FloatArray, reference: FloatArray) -> float:
-        sizes = np.log(np.maximum([rms, reference], _TINY)) - np.log(self._scale)
-        sizes = np.maximum(sizes, sizes.max() + np.log(_LEAST_SHARE))
-        return float(2.0 * np.sum(self._independent_samples * (sizes[0] - sizes[1])))
-
-    def connected(self, optimum: Optimum, rivals: Sequence[Optimum]) -> list[bool]:
-        """Whether ways lead from one to others on which the data rule nothing out.
-
-        The coordinate that differs by most deviations, so none that is only felt with others, is
-        moved in steps, all others are fitted to each.
-        """
-        objective, coded = optimum.objective, self._objective.space.encode
-        start, ends = coded(optimum.chromosome), [coded(rival.chromosome) for rival in rivals]
-        places = [int(np.argmax(np.abs(end - start) / self._deviations)) for end in ends]
-        at, passable = [start] * len(ends), [True] * len(ends)
-        for part in _WAY:
-            descents = {}
-            for k in np.flatnonzero(passable).tolist():
-                place, way = places[k], ends[k] - at[k]
-                coordinate = start[place] + part * (ends[k] - start)[place]
-                left = way[place]  # nothing, of two that rounding alone sets apart
-                begun = at[k] + ((coordinate - at[k][place]) / left if left else 0.0) * way
-                held = Restriction(held=(place, float(coordinate)))
-                descents[k] = begin(
-                    objective, objective.space.decode(begun), tolerance=_ROUGHLY, restriction=held
-                )
-            fits = refine_each(
-                objective,
-                list(descents.values()),
-                max_iterations=_QUICKLY,
-                enough=lambda point: self._alike(point, optimum),
-            )
-            for k, fit in zip(descents, fits, strict=True):
-                reached = _optimum(objective, fit.chromosome, fit.rms)
-                passable[k] = self.deviance(reached, optimum) < _TOLD_APART
-                at[k] = coded(fit.chromosome)
-        return passable
-
-    def _alike(self, point: Point, optimum: Optimum) -> bool:
-        """Whether the data do not tell a point that was simulated from an optimum."""
-        rms = point.accurate_rms
-        return rms is not None and self._deviance(rms, optimum.rms) < _TOLD_APART
-
-    @cached_property
-    def _independent_samples(self) -> FloatArray:
-        """Independent samples that each output's errors amount to, (n_outputs,)."""
-        first = self._sensitivity
-        noise = colour(first.residual, first.seen, first.lengths)
-        memory = longest_memory(noise, np.mean(first.residual**2, axis=0))
-        weights = self._objective.weights * len(self._objective.weights)
-        samples: FloatArray = weights * np.maximum(self._objective.counts / memory, _FEWEST)
-        return samples
-
-    @cached_property
-    def _information(self) -> FloatArray:
-        """Fisher information of the coordinates, (n_free, n_free), were errors white."""
-        first = self._sensitivity
-        rms: FloatArray = np.sqrt(np.mean(first.residual**2, axis=0)) / self._scale
-        rms = self._scale * np.maximum(rms, max(_LEAST_SHARE * rms.max(), _TINY))
-        slopes = (first.slopes / rms[:, None]).reshape(-1, first.slopes.shape[2])
-        information: FloatArray = slopes.T @ slopes
-        return information
-
-    @cached_property
-    def _deviations(self) -> FloatArray:
-        """Deviations of the coordinates, (n_free,), were errors white, but for a common factor."""
-        width = self._objective.space.width
-        information = self._information * np.outer(width, width)
-        most = max(float(np.diag(information).max()), _TINY)
-        inverse = np.linalg.inv(information / most + _SLACK * np.eye(len(width)))
-        deviations: FloatArray = np.sqrt(np.maximum(np.diag(inverse), 1.0)) * width
-        return deviations
-
-    @cached_property
-    def _shown(self) -> Shown:
-        first = self._sensitivity
-        return Shown(ties(first), self._objective.space, first.chromosome)
-
-    @cached_property
-    def _sensitivity(self) -> Sensitivity:
-        return sensitivity(self._optima[0].objective, self._optima[0].chromosome)
+    return optimum if end is None else Optimum.of(objective, end.chromosome, end.rms)
 
 
 def _explored(
@@ -313,12 +160,12 @@ def _explored(
     *,
     lookalike: bool,
     roughly: bool = False,
-) -> _Optima:
+) -> Optima:
     """Minima (n_free,) refined by likelihood, and those that look like the best.
 
     Without lookalikes the first is the best, and the others are refined as long as they may be it.
     """
-    optima = _Optima(objective)
+    optima = Optima(objective)
     for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
     explored = None
@@ -336,16 +183,16 @@ def _explored(
 
 
 def _in_noise(
-    objective: Objective, optima: _Optima, watch: Watch | None
-) -> tuple[Objective, _Optima]:
+    objective: Objective, optima: Optima, watch: Watch | None
+) -> tuple[Objective, Optima]:
     """Minima anew by as many steps as the best one's errors let the data tell, if by more."""
     best, *others = optima.ranked()
-    rms = np.maximum(best.rms, max(_LEAST_SHARE * best.rms.max(), _TINY))
+    rms = np.maximum(best.rms, max(LEAST_SHARE * best.rms.max(), TINY))
     finer = fine_enough(best.objective, best.chromosome, rms)
     if finer is best.objective:
         return objective, optima
     near = (optimum for optimum in others if optima.deviance(optimum, best) < _CONCEIVABLE)
-    minima = _chromosomes([best, *near])
+    minima = chromosomes_of([best, *near])
     objective = objective.finer(finer.simulator.accuracy)
     return objective, _explored(objective, minima, watch, lookalike=False)
 
@@ -354,12 +201,12 @@ def _weighed(
     objective: Objective, chromosome: FloatArray, watch: Watch | None, *, roughly: bool = False
 ) -> Optimum:
     """The minimum by the inverse of its errors: weights and parameters in turn."""
-    tolerance = _ROUGHLY if roughly else TOLERANCE
+    tolerance = ROUGHLY if roughly else TOLERANCE
     given, rms = objective.weights, objective.rms(chromosome[None])[0]
     # A refinement may end where a simulation takes more steps than a chromosome is allowed.
     noisy = np.isfinite(rms).all() and not noiseless(objective, chromosome, rms)
     for _ in range(_ROUNDS if noisy else 0):
-        weights = given / np.maximum(rms, max(_LEAST_SHARE * rms.max(), 1e-300))
+        weights = given / np.maximum(rms, max(LEAST_SHARE * rms.max(), 1e-300))
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
         objective = weighed
@@ -368,18 +215,18 @@ def _weighed(
         settled = steady and end.iterations < MOST_ITERATIONS  # along bent valleys it takes more
         if settled or not np.isfinite(rms).all():
             break
-    return _optimum(objective, chromosome, rms)
+    return Optimum.of(objective, chromosome, rms)
 
 
 def _refitted(
     fit: Callable[[Optimum, Watch | None], Optimum | None],
     objective: Objective,
     ranked: Sequence[Optimum],
-    by_error: _Optima,
+    by_error: Optima,
     watch: Watch | None,
     *,
     settled: bool,
-) -> _Optima | None:
+) -> Optima | None:
     """The best optimum and those not told from it by the error, refitted for noisy inputs.
 
     None where without corrections the inputs' noise would explain more than there is. The others
@@ -397,7 +244,7 @@ def _refitted(
     if filters:
         first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
     too_well = _too_well(ranked[0].rms)
-    optima, best, explored = _Optima.around(first, objective, too_well), first, None
+    optima, best, explored = Optima.around(first, objective, too_well), first, None
     for _ in range(_EXPLORED_BY_FILTER if filters else 1):
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break
@@ -406,13 +253,13 @@ def _refitted(
         starts += lookalikes(first.objective, best.chromosome) if explores else []
         exact = _exact_among(first, starts) if filters else None
         if exact is not None:
-            optima = _Optima.around(exact, objective, too_well)
+            optima = Optima.around(exact, objective, too_well)
             first = best = explored = exact
         ends = _conceivable(first.objective, starts, optima, best)
         for optimum in _compared(first.objective, ends):
             optima.add(optimum)
         (best, *others), starts = optima.ranked(), []
-        if filters and optima.deviance(first, best) > _TOLD_APART:
+        if filters and optima.deviance(first, best) > TOLD_APART:
             anew = fit(replace(best, objective=ranked[0].objective), watch)
             if anew is None or not _foresees_more(anew, first):
                 optima.refit(best, anew)
@@ -420,7 +267,7 @@ def _refitted(
             else:
                 near = (o for o in others if optima.deviance(o, best) < _CONCEIVABLE)
                 starts = [optimum.chromosome for optimum in near]
-                optima, best = _Optima.around(anew, objective, too_well), anew
+                optima, best = Optima.around(anew, objective, too_well), anew
                 first, explored = anew, None
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
@@ -433,8 +280,8 @@ def _compared(objective: Objective, ends: Sequence[Refinement]) -> list[Optimum]
         return []
     begun = [begin(objective, end.chromosome) for end in ends]
     chromosomes = [end.chromosome for end in refine_each(objective, begun)]
-    errors = _exactly(objective).rms(np.stack(chromosomes))
-    return [_optimum(objective, *pair) for pair in zip(chromosomes, errors, strict=True)]
+    errors = to_compare(objective).rms(np.stack(chromosomes))
+    return [Optimum.of(objective, *pair) for pair in zip(chromosomes, errors, strict=True)]
 
 
 def _exact_among(first: Optimum, starts: Sequence[FloatArray]) -> Optimum | None:
@@ -445,16 +292,11 @@ def _exact_among(first: Optimum, starts: Sequence[FloatArray]) -> Optimum | None
         return None
     exact = fitted.exact_means
     end = refine(exact, first.chromosome)
-    return _optimum(exact, end.chromosome, end.rms)
-
-
-def _exactly(objective: Objective) -> Objective:
-    """By which minima far from one another are compared."""
-    return objective.uneased if isinstance(objective, Innovations) else objective
+    return Optimum.of(exact, end.chromosome, end.rms)
 
 
 def _conceivable(
-    objective: Objective, starts: Sequence[FloatArray], optima: _Optima, best: Optimum
+    objective: Objective, starts: Sequence[FloatArray], optima: Optima, best: Optimum
 ) -> list[Refinement]:
     """Where descents come to soon, what is no minimum yet known and not far behind the best.
 
@@ -469,7 +311,7 @@ def _conceivable(
     return [
         end
         for end in _quickly(objective, starts, optima.new)
-        if optima.deviance(_optimum(objective, end.chromosome, end.rms), best) < _CONCEIVABLE
+        if optima.deviance(Optimum.of(objective, end.chromosome, end.rms), best) < _CONCEIVABLE
     ]
 
 
@@ -477,7 +319,7 @@ def _conceivable_by(
     excerpt: Excerpt,
     objective: Objective,
     starts: Sequence[FloatArray],
-    optima: _Optima,
+    optima: Optima,
     best: Optimum,
 ) -> list[FloatArray]:
     """What is left of starts (n_free,), moved to their minima on an excerpt, by that alone.
@@ -488,8 +330,8 @@ def _conceivable_by(
     first = refine(
         part,
         excerpt.on_parts(space, part.space, best.chromosome),
-        tolerance=_ROUGHLY,
-        max_iterations=_QUICKLY,
+        tolerance=ROUGHLY,
+        max_iterations=QUICKLY,
     )
     (there,) = excerpt.on_all(part.space, [first.chromosome])[1]
     back = space.encode(best.chromosome) - space.encode(there)
@@ -506,13 +348,9 @@ def _conceivable_by(
 
     ends = _quickly(part, begun, new)
     share = excerpt.n_samples / sum(record.n_samples for record in objective.records)
-    minimum = _optimum(part, first.chromosome, first.rms)
-    near = [
-        end.chromosome
-        for end in ends
-        if share * optima.deviance(_optimum(part, end.chromosome, end.rms), minimum) < _CONCEIVABLE
-    ]
-    return on_all(near) if near else []
+    minimum, *reached = (Optimum.of(part, end.chromosome, end.rms) for end in [first, *ends])
+    near = [o for o in reached if share * optima.deviance(o, minimum) < _CONCEIVABLE]
+    return on_all(chromosomes_of(near)) if near else []
 
 
 def _quickly(
@@ -525,13 +363,12 @@ def _quickly(
     for first in range(0, len(starts), _AT_ONCE):
         before = [end.chromosome for end in ends]
         descents = [
-            begin(objective, start, tolerance=_ROUGHLY)
-            for start in starts[first : first + _AT_ONCE]
+            begin(objective, start, tolerance=ROUGHLY) for start in starts[first : first + _AT_ONCE]
         ]
         wave = refine_each(
             objective,
             descents,
-            max_iterations=_QUICKLY,
+            max_iterations=QUICKLY,
             enough=partial(_known, objective, new, before),
         )
         for end in sorted(wave, key=lambda end: end.error):
@@ -581,7 +418,7 @@ def _foresees_more(optimum: Optimum, rival: Optimum) -> bool:
         return optimum.feasible
     common = fitted.of_noise(np.minimum(fitted.noise, before.noise)).uneased
     rms = common.rms(np.stack([optimum.chromosome, rival.chromosome]))
-    loss = np.log(np.maximum(rms, _TINY)) @ (fitted.counts * (fitted.weights > 0.0))
+    loss = np.log(np.maximum(rms, TINY)) @ (fitted.counts * (fitted.weights > 0.0))
     return bool(loss[0] < loss[1])
 
 
@@ -606,7 +443,7 @@ def noisy_fit(
         rms = fitted.rms(chromosome[None])[0]
         if not np.isfinite(rms).all():  # a filter needs more steps here than there may be
             break
-        weighed = fitted.weighed(objective.weights / (too_well * np.maximum(rms, _TINY)))
+        weighed = fitted.weighed(objective.weights / (too_well * np.maximum(rms, TINY)))
         steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
         end = refine(weighed, chromosome, on_iteration=watch)
         chromosome, rms, fitted = end.chromosome, end.rms, weighed
@@ -621,7 +458,7 @@ def noisy_fit(
             fitted = anew
         else:
             fitted, last = towards(fitted, fitted.settled(chromosome), last)
-    return _optimum(fitted, chromosome, rms)
+    return Optimum.of(fitted, chromosome, rms)
 
 
 def _too_well(rms: FloatArray) -> FloatArray:
@@ -630,7 +467,7 @@ def _too_well(rms: FloatArray) -> FloatArray:
     rms: of free runs' errors, for noise of the inputs may leave hardly anything of an innovation.
     """
     with np.errstate(over="ignore"):  # where simulations failed
-        factors: FloatArray = np.maximum(1.0, _LEAST_SHARE * rms.max() / np.maximum(rms, _TINY))
+        factors: FloatArray = np.maximum(1.0, LEAST_SHARE * rms.max() / np.maximum(rms, TINY))
     return factors
 
 
@@ -647,8 +484,3 @@ def towards(
     part = np.divide(change, last, out=np.zeros_like(change), where=last != 0.0)
     change = change / np.where(part < _SWINGING, 1.0 - part, 1.0)
     return settled.of_noise(fitted.noise * np.exp(change)), change
-
-
-def _optimum(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Optimum:
-    finite = np.where(np.isfinite(rms), rms, np.finfo(np.float64).max)
-    return Optimum(objective, chromosome, finite, objective.space.feasible(chromosome))

@@ -28,7 +28,8 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi.excerpt import Excerpt
-from sysid.gassi.likelihood import Optimum, better_by_filter, noisy_fit, towards
+from sysid.gassi.likelihood import better_by_filter, noisy_fit, towards
+from sysid.gassi.optima import Optimum
 from sysid.uncertainty import uncertainty
 from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
