@@ -10,7 +10,8 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from numbers import Real
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -60,7 +61,13 @@ class State:
     first_sample: bool = True
 
     def __post_init__(self) -> None:
+        _check_number(
+            f"state {self.name}: initial", self.initial,
+            "; what is to be estimated has an initial_range=(low, high)",
+        )  # fmt: skip
         if self.initial_range is not None and self.initial_range != AROUND_FIRST_SAMPLE:
+            if not (isinstance(self.initial_range, Sequence) and len(self.initial_range) == 2):
+                raise ModelError(f"state {self.name}: initial_range is no pair (low, high)")
             check_range(f"{self.name}(0)", *self.initial_range)
 
 
@@ -82,6 +89,9 @@ class Input:
     hold: Hold = "zoh"
     description: str = ""
     reaction: tuple[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        _check_choice(f"input {self.name}: hold", self.hold, get_args(Hold))
 
 
 @dataclass(frozen=True)
@@ -123,10 +133,10 @@ class Parameter:
     corrects: str = ""
 
     def __post_init__(self) -> None:
+        _check_choice(f"parameter {self.name}: scale", self.scale, get_args(Scale))
         if not self.fixed:
             check_range(self.name, self.lower, self.upper, self.scale)
-        if not math.isfinite(self.nominal):
-            raise ModelError(f"parameter {self.name}: nominal value {self.nominal} is not finite")
+        _check_number(f"parameter {self.name}: nominal value", self.nominal)
         if not self.minimum <= self.nominal <= self.maximum:
             raise ModelError(
                 f"parameter {self.name}: nominal value {self.nominal} is outside its physical "
@@ -136,8 +146,8 @@ class Parameter:
 
 def check_range(name: str, lower: float, upper: float, scale: Scale = "linear") -> None:
     """Raise ModelError unless ``lower < upper``, both finite, and positive on a log scale."""
-    if not (math.isfinite(lower) and math.isfinite(upper)):
-        raise ModelError(f"parameter {name}: range [{lower}, {upper}] is not finite")
+    if not (_is_finite(lower) and _is_finite(upper)):
+        raise ModelError(f"parameter {name}: range [{lower!r}, {upper!r}] is not finite")
     if lower >= upper:
         raise ModelError(
             f"parameter {name}: range [{lower:g}, {upper:g}] has its low end at or above its "
@@ -147,6 +157,20 @@ def check_range(name: str, lower: float, upper: float, scale: Scale = "linear") 
         raise ModelError(
             f"parameter {name}: a log scale needs a positive range, but it starts at {lower:g}"
         )
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
+
+
+def _check_number(what: str, value: object, cure: str = "") -> None:
+    if not _is_finite(value):
+        raise ModelError(f"{what} {value!r} is no finite number{cure}")
+
+
+def _check_choice(what: str, value: object, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise ModelError(f"{what} {value!r} is none of {', '.join(choices)}")
 
 
 @dataclass(frozen=True)

@@ -86,12 +86,30 @@ def test_a_constraint_that_raises_is_named():
         ((1.0, math.nan, 1.0), "not finite"),
         ((1.0, 0.0, 2.0, "log"), "log scale needs a positive range"),
         ((-1.0, 0.5, 2.0), "nominal value -1.0 is outside its physical limits"),
-        ((math.nan, 0.5, 2.0), "nominal value nan is not finite"),
+        ((math.nan, 0.5, 2.0), "nominal value nan is no finite number"),
+        (("1", 0.5, 2.0), "nominal value '1' is no finite number"),
+        ((1.0, 0.5, "2"), r"range \[0.5, '2'\] is not finite"),
+        ((1.0, 0.5, 2.0, "logarithmic"), "scale 'logarithmic' is none of linear, log"),
     ],
 )
 def test_bad_parameters(settings, message):
     with pytest.raises(ModelError, match=message):
         Parameter("R", "ohm", *settings)
+
+
+@pytest.mark.parametrize(
+    ("declared", "message"),
+    [
+        (lambda: State("y", "V", initial="estimate"), "'estimate' is no finite number; what is to"),
+        (lambda: State("y", "V", initial=math.nan), "state y: initial nan is no finite number"),
+        (lambda: State("y", "V", initial_range=(1.0,)), "initial_range is no pair"),
+        (lambda: State("y", "V", initial_range=5.0), "initial_range is no pair"),
+        (lambda: Input("u", "V", hold="ZOH"), "hold 'ZOH' is none of zoh, foh, spline"),
+    ],
+)
+def test_bad_signals(declared, message):
+    with pytest.raises(ModelError, match=message):
+        declared()
 
 
 def test_a_fixed_parameter_needs_no_range():

@@ -52,7 +52,7 @@ def test_a_log_range_that_touches_zero_is_searched_linearly():
         ({"tau": (0.1, 0.2)}, {"tau": 0.1}, "both a range and a fixed value"),
         ({}, {"gain": 1.0, "tau": 1.0}, "every parameter is fixed"),
         ({}, {"tau": -1.0}, "physical limits"),
-        ({}, {"tau": np.nan}, "not finite"),
+        ({}, {"tau": np.nan}, "no finite number"),
     ],
 )
 def test_bad_spaces(ranges, fixed, message):
