@@ -111,7 +111,7 @@ def suspected(
         if any(p.pushed for p in uncertainty.parameters):
             # What an end of a range leaves looks like something missing.
             freed = _freed(estimator.final_objective(list(training)), estimator.final_chromosome_)
-            tested = intervals(*freed)
+            tested = intervals(*freed, profiled=range(len(freed[0].space.index)))
             findings = missing_physics(*freed, tested)
         else:
             missing = missing or score_tests_of(estimator, training).findings

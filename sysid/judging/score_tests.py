@@ -231,7 +231,10 @@ class _Tests:
         tests = copy(self)
         tests.findings = []
         tests._ends = [self._columns.shape[2]]  # of the columns until each finding
-        tests._estimates = [e for e in uncertainty.determined() if e.deviation]
+        # Starts of a very long record's parts are nobody's parameters.
+        names = self._local.objective.space.names
+        estimates = (e for e in uncertainty.determined() if e.combination or e.name in names)
+        tests._estimates = [e for e in estimates if e.deviation]
         gradients = [_gradient(self._local, e) for e in tests._estimates]
         tests._gradients = np.array(gradients).reshape(-1, self._local.slopes.shape[2])
         return tests

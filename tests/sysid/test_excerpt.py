@@ -12,6 +12,7 @@ from sysid import GASSI, BatchSimulator, Dataset, Input, Output, Parameter, Stat
 from sysid.fitting.objective import Objective
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.nudged import nudged
+from sysid.judging.examination import verdict_of
 from sysid.problem.space import SearchSpace
 from tests.sysid.support import lag, prbs
 
@@ -219,6 +220,7 @@ def test_a_very_long_record_is_fitted_by_parts_however_it_swings(very_long_recor
     for estimate, truth in zip(found.parameters, [*SWINGING, 0.0, 0.0], strict=True):
         assert estimate.low < truth < estimate.high
     assert found.covariance.shape == (4, 4) and found.factor.shape[1] == 4
+    assert verdict_of(estimator, [very_long_record]).parameters.trust == "good"
     free = BatchSimulator(swing()).trajectories(estimator.vector_, very_long_record)[0]
     assert np.std(free - very_long_record.outputs) == pytest.approx(1e-4, rel=0.05)
 
