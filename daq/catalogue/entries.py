@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import datetime
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -148,6 +150,8 @@ def _run(folder: Path) -> dict[str, Any]:
         "rig": rig.get("name"),
         "device": record.get("device"),
     }
+    if facts["started"] is not None:
+        datetime.datetime.fromisoformat(facts["started"])
     return {key: str(value) for key, value in facts.items() if value is not None}
 
 
@@ -174,7 +178,12 @@ def _identified(folder: Path) -> dict[str, Any]:
 
 
 def _plain(row: QuantityRow) -> tuple[Any, ...]:
-    """The fields of a row, without those that only a table of parameters shows."""
+    """The fields of a row, without those that only a table of parameters shows.
+
+    Raises TypeError or ValueError for what is no number in a file that somebody has edited.
+    """
+    for number in (row.value, row.std, *(row.interval or ()), *(row.here or ())):
+        math.isfinite(0.0 if number is None else number)
     return tuple(getattr(row, name) for name in _FIELDS)
 
 

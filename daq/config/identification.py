@@ -376,11 +376,10 @@ class IdentificationConfig(Signals):
     )
     criterion: Literal["auto", "compensated", "innovations", "likelihood", "error"] = Field(
         "auto",
-        description="likelihood: in the end each output weighs by its own error; compensated: "
-        "also without what noise of measured inputs does to the errors; innovations: those of an "
-        "extended Kalman filter for that noise; error: the mean RMSE decides to the end; auto: "
-        "innovations where a calibration tells noise of an input and the counts when an encoder "
-        "measured, compensated where it tells the noise alone, else likelihood",
+        description="what decides in the end. likelihood: errors of free runs, each output weighed "
+        "by its own; compensated: the same, less what noise of measured inputs adds; innovations: "
+        "errors of an extended Kalman filter for that noise; error: the mean RMSE; auto: "
+        "innovations or compensated where a calibration tells that noise, else likelihood",
     )
     process_noise: dict[str, Annotated[float, Field(ge=0.0, allow_inf_nan=False)]] = Field(
         default_factory=dict,

@@ -15,8 +15,9 @@ USUAL = 800.0  # Hz, of the shipped experiments
 _SPAN = 2.5  # s in each mode: as long as a timer takes to show that it is too slow
 _FEW = 0.01  # of the commands
 _LATE = (
-    "where wake-ups below are late as well, end other programs; otherwise it is the line there and "
-    "back: sample more slowly (--rate), or send further ahead (ahead in the experiment's file)"
+    "where wake-ups below are late as well, end other programs; otherwise the way over the line "
+    "and back takes too long: sample more slowly (--rate), or send further ahead (ahead in the "
+    "experiment's file)"
 )
 
 

@@ -127,12 +127,15 @@ def forget(folder: Path) -> None:
 def result_file(result: str | Path) -> Path:
     """The ``parameters.yaml`` of an identification, given as it is, as its folder or its run's.
 
-    Raises ConfigError for a folder without any.
+    Raises ConfigError for a folder without any, and for a log.
 
     >>> result_file("runs/a/parameters.yaml").name
     'parameters.yaml'
     """
     given = Path(result)
+    if given.suffix in (".csv", ".mat"):
+        problem, cure = "this is a log", f"name its identification's folder, or a {PARAMETERS}"
+        raise ConfigError(problem, cure=cure, file=given)
     if not given.is_dir():
         return given
     for place in (given, given / "identification"):

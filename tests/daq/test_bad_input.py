@@ -506,6 +506,8 @@ CASES = [
          {"run/log.csv": original_text(), "run/run.json": "{"}),
     Case("replay of parameters that are none", ["replay", "log.csv", "--parameters", "p.yaml"],
          ["p.yaml:1:1: model: this key is missing"], {"p.yaml": "a: 1\n"}),
+    Case("replay of a log for parameters", ["replay", "log.csv", "--parameters", "log.csv"],
+         ["rig: log.csv: this is a log; name its identification's folder, or a parameters.yaml"]),
     Case("replay of an unknown parameter", ["replay", "log.csv", "--parameters", "p.yaml"],
          ["p.yaml:3:3: parameters.K_n: model actuator has no such parameter"],
          {"p.yaml": "model: actuator\nparameters:\n  K_n: 1\n"}),

@@ -200,6 +200,24 @@ def test_runs_without_samples_are_left_out_of_a_figure_and_of_an_identification(
     assert len(json.loads(result.stdout)["metrics"]["training"]) == 2
 
 
+def test_numbers_and_dates_that_were_edited_into_nonsense_end_no_listing(lab, tmp_path):
+    first, second, _ = captures(lab)
+    for capture in (first, second):
+        shutil.copytree(lab / capture, tmp_path / capture)
+    result = tmp_path / first / "identification" / "parameters.yaml"
+    content = yaml.safe_load(result.read_text())
+    content["parameters"]["gain"]["interval"] = ["abc", 1.0]
+    result.write_text(yaml.safe_dump(content))
+    record = tmp_path / second / "run.json"
+    record.write_text(json.dumps({**json.loads(record.read_text()), "started": {"a": 1}}))
+    for words in (("--parameters", "gain"), ("--compare", "--plot", "all.png")):
+        seen = rig("runs", *words, cwd=tmp_path)
+        assert seen.returncode == 0, seen.stderr
+        assert all(
+            f"{capture}: not as it was written" in seen.stderr for capture in captures(lab)[:2]
+        )
+
+
 def test_tags_and_notes_are_put_on_runs_and_taken_away(lab):
     (run,) = listed(lab, "brushes", "--tag", "ageing", "--note", "operator=", "--note", "brake=3")
     assert run["metadata"] == {"note": "brushes replaced", "tags": ["ageing"], "brake": 3}
