@@ -23,7 +23,9 @@ _STEP, _HOLD, _STEPS = 0.2, 0.05, 4  # of the commands: in parts of their ranges
 _WELL = 0.8  # of the draws, whose integration is to be as exact as that
 _FOLLOWED, _MINORITY = 5, 0.5  # draws that are compared, and their share that may go astray
 _ASTRAY = 0.05  # of the noise, by which a model may err where it is right
-_TURNS = 0.4  # of the samples, to which a shaft may turn round for torque and edges to tell why
+# Of the samples, to which a shaft may turn round for torque and edges to tell why: at first, when
+# all that is told of torques hangs on it, and once there is an earlier result.
+_TURNS = 0.2, 0.4
 _BETWEEN = 0.5  # of a speed's noise or of what its edges make, by which it may err in that
 _ACCURACY = 1e-2  # of the plant, beside which margins are wide
 _FINER = 1, 2, 4  # times the steps that commands need, where an amplifier ends
@@ -39,7 +41,8 @@ class PlantBench:
     of its range, would lead its parameters astray, and is refused as well. timed: whether the
     rig's speed is one count over the time between edges, whose instants err; a run in which the
     shaft turns round every few samples is refused then. identified: whether the draws are those of
-    an identification: then none that is compared may lead the model astray. strays, turning: runs
+    an identification: then none that is compared may lead the model astray, and a shaft may turn
+    round more often. strays, turning: runs
     that were refused since the plant does what the model does not, or since the shaft turns round.
     """
 
@@ -242,7 +245,7 @@ class PlantBench:
         show such a turn.
         """
         turns = np.mean(omega[1:] * omega[:-1] < 0.0)
-        return not self._timed or bool(turns <= _TURNS)
+        return not self._timed or bool(turns <= _TURNS[self._identified])
 
     def _follows(
         self,

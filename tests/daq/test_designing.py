@@ -133,14 +133,21 @@ def test_a_run_at_the_end_of_a_supply_takes_the_steps_that_it_needs():
     assert records is not None
 
 
-@pytest.mark.parametrize(("frequency", "passes"), [(200.0, False), (4.0, True)])
-def test_a_shaft_that_turns_round_every_few_samples_tells_edges_no_speed(frequency, passes):
+@pytest.mark.parametrize(
+    ("frequency", "identified", "passes"),
+    [(200.0, True, False), (120.0, False, False), (120.0, True, True), (4.0, False, True)],
+)
+def test_a_shaft_that_turns_round_every_few_samples_tells_edges_no_speed(
+    frequency, identified, passes
+):
     config, device = load_rig("simulated.yaml")
     model, noise = actuator(parameters="rig"), {"current_motor": 0.005, "omega": 0.1}
     time = np.arange(400) / 800.0
     shaken = np.column_stack([0.1 + 0.9 * np.sin(2.0 * np.pi * frequency * time), np.zeros(400)])
     for timed in (False, True):
-        careful = PlantBench(model, device.plant_model(5.0), config, 5.0, 0.1, noise, timed)
+        careful = PlantBench(
+            model, device.plant_model(5.0), config, 5.0, 0.1, noise, timed, identified
+        )
         records = careful.records(shaken, 1.0 / 800.0, model.nominal[None])
         assert (records is not None) == (passes or not timed)
         assert (careful.turning, careful.strays) == (timed and not passes, 0)
