@@ -303,9 +303,9 @@ def _outcome(runs: Sequence[Run], parcel: bytes) -> tuple[int, Outcome]:
     place, fitted, training, validation, seconds, problem = unpack(parcel)
     run = runs[place]
     if fitted is not None:
-        fitted.model = run.model
-        fitted.space_ = replace(fitted.space_, model=run.model)
-        fitted.threads = run.settings.get("threads")
+        fitted.model, fitted.threads = run.model, run.settings.get("threads")
+        # With the starts that the fit has estimated by itself.
+        fitted.space_ = replace(fitted.space_, model=fitted.simulator().model)
     return place, Outcome(run, fitted, training, validation, seconds, problem)
 
 

@@ -472,7 +472,7 @@ class GASSI(RecordEstimator):
         data = self._records(X, y, records, None, reset=False)
         objective = self._of_parts(self._objective(data)).weighed(self.output_weights_)
         objective = self._at_final_accuracy(objective)
-        if objective.records is not data and self.space_.estimated:
+        if self.excerpt_ is not None and self.excerpt_.cut and self.space_.estimated:
             objective = objective.over(self.space_.without_starts().with_starts(objective.records))
         if self.output_noise_ is None:
             return objective

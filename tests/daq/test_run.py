@@ -106,6 +106,7 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
         "calibration": {"samples": 16, "motion": 0.01, "current_motor": 0.1, "current_brake": 0.05},
         "name": "",
         "rig": "",
+        "model": "",
         "validation": {},
         "metadata": {"operator": "", "sample": "", "note": "", "tags": []},
     }
