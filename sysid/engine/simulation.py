@@ -120,12 +120,14 @@ class BatchSimulator:
 
     def of(self, model: ProcessModel) -> BatchSimulator:
         """The same simulations of another model."""
-        return BatchSimulator(
-            model, accuracy=self.accuracy, threads=self.threads, max_steps=self.max_steps
-        )
+        return self._like(self.accuracy, self.max_steps, model)
 
-    def _like(self, accuracy: float, most: int) -> BatchSimulator:
-        return BatchSimulator(self.model, accuracy=accuracy, threads=self.threads, max_steps=most)
+    def _like(
+        self, accuracy: float, most: int, model: ProcessModel | None = None
+    ) -> BatchSimulator:
+        return BatchSimulator(
+            model or self.model, accuracy=accuracy, threads=self.threads, max_steps=most
+        )
 
     def errors(
         self,

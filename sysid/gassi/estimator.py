@@ -249,7 +249,8 @@ class GASSI(RecordEstimator):
         self.output_noise_: FloatArray | None = None
         self.averaged_inputs_ = False
         self.excerpt_ = self._excerpt(data) if preset.refine else None
-        searched, objective = self._searched(objective), self._of_parts(objective)
+        searched = self._searched(objective)
+        objective = objective if self._cut is None else self._cut.among(objective)
         begin = begin if preset.refine else None
         run = self._search_run(searched, preset, begin)
         checkpoints = self._checkpoints(data, run, checkpoint, resume)
@@ -412,9 +413,9 @@ class GASSI(RecordEstimator):
         """
         objective = self.final_objective(X, y, records)
         minima = self.final_chromosome_, self._rivals, self._ridge
-        if self.excerpt_ is None or not self.excerpt_.cut:
+        if self._cut is None:
             return uncertainty(objective, *minima)
-        places = self.excerpt_.places_on_all(objective.space)
+        places = self._cut.places_on_all(objective.space)
         return uncertainty(objective, *minima, profiled=places).of(places, self.space_.names)
 
     @one_thread()
@@ -470,10 +471,9 @@ class GASSI(RecordEstimator):
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
         data = self._records(X, y, records, None, reset=False)
-        objective = self._of_parts(self._objective(data)).weighed(self.output_weights_)
-        objective = self._at_final_accuracy(objective)
-        if self.excerpt_ is not None and self.excerpt_.cut and self.space_.estimated:
-            objective = objective.over(self.space_.without_starts().with_starts(objective.records))
+        objective = self._objective(data)
+        objective = objective if self._cut is None else self._cut.of_all(objective)
+        objective = self._at_final_accuracy(objective.weighed(self.output_weights_))
         if self.output_noise_ is None:
             return objective
         return Innovations.of(
@@ -519,16 +519,15 @@ class GASSI(RecordEstimator):
             return excerpt
         return replace(excerpt, cut=True)
 
-    def _of_parts(self, objective: Objective) -> Objective:
-        """An objective of the records as that of what the fit goes by."""
-        excerpt = self.excerpt_
-        return objective if excerpt is None or not excerpt.cut else excerpt.among(objective)
+    @property
+    def _cut(self) -> Excerpt | None:
+        """The parts that the whole fit goes by, where it does."""
+        return self.excerpt_ if self.excerpt_ is not None and self.excerpt_.cut else None
 
     def _searched(self, objective: Objective) -> Objective:
         """An objective of the records as that of what the search goes by."""
-        excerpt, held = self.excerpt_, None
-        if excerpt is not None and excerpt.cut:
-            held = nudged(objective.simulator, excerpt)
+        excerpt = self.excerpt_
+        held = None if self._cut is None else nudged(objective.simulator, self._cut)
         if held is not None:
             simulator, excerpt = held
             objective = objective.simulated_by(simulator)
@@ -704,8 +703,8 @@ class GASSI(RecordEstimator):
     def _set_best(self, best: Best) -> None:
         space, chromosome, self.error_, self.feasible_ = best
         self.final_chromosome_: FloatArray = chromosome
-        if self.excerpt_ is not None and self.excerpt_.cut:
-            space, (chromosome,) = self.excerpt_.on_all(space, [chromosome])
+        if self._cut is not None:
+            space, (chromosome,) = self._cut.on_all(space, [chromosome])
         self.space_, self.chromosome_ = space, chromosome
         self.vector_ = self.space_.full(self.chromosome_)
         self.parameters_ = self._named(self.vector_)

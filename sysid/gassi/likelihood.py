@@ -206,7 +206,7 @@ def _weighed(
     # A refinement may end where a simulation takes more steps than a chromosome is allowed.
     noisy = np.isfinite(rms).all() and not noiseless(objective, chromosome, rms)
     for _ in range(_ROUNDS if noisy else 0):
-        weights = given / np.maximum(rms, max(LEAST_SHARE * rms.max(), 1e-300))
+        weights = given / np.maximum(rms, max(LEAST_SHARE * rms.max(), TINY))
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
         objective = weighed
