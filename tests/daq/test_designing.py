@@ -109,17 +109,25 @@ def test_a_limit_is_kept_by_the_margin():
 def test_an_amplifier_is_kept_from_the_end_of_its_supply_by_the_margin(volts, margin, passes):
     config, device = load_rig("simulated.yaml")
     model, noise = actuator(parameters="rig"), {"current_brake": 0.005, "omega": 0.1}
-    careful = PlantBench(model, device.plant_model(5.0), config, 5.0, margin, noise)
+    plant = device.plant_model(5.0)
+    careful, identified = (
+        PlantBench(model, plant, config, 5.0, margin, noise, identified=later)
+        for later in (False, True)
+    )
     step = commands(0.0, volts)  # at 0.25 V it ends: errors of a fifth of the noise
     step[:50] = 0.0
     vectors = np.tile(model.nominal, (5, 1))
     assert (careful.records(step, 1.0 / 800.0, vectors) is not None) == passes
     stiff = np.array(model.nominal)
     stiff[model.parameter_names.index("R_b")] *= 1.6
-    of_some, of_most = (np.vstack([vectors[: 5 - n], np.tile(stiff, (n, 1))]) for n in (2, 3))
+    of_one, of_some, of_most = (
+        np.vstack([vectors[: 5 - n], np.tile(stiff, (n, 1))]) for n in (1, 2, 3)
+    )
     if passes:
         assert careful.records(step, 1.0 / 800.0, of_some) is not None
         assert careful.records(step, 1.0 / 800.0, of_most) is None
+        assert identified.records(step, 1.0 / 800.0, vectors) is not None
+        assert identified.records(step, 1.0 / 800.0, of_one) is None
 
 
 def test_a_run_at_the_end_of_a_supply_takes_the_steps_that_it_needs():
