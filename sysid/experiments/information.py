@@ -21,7 +21,6 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.scheme import LANES
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.disturbance import with_disturbances
-from sysid.fitting.means import mean_of_sides
 from sysid.identifiability import null_directions
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
@@ -168,7 +167,7 @@ class Informant:
         if not record.jitter.any():
             return white
         rates = np.diff(outputs, axis=1) / record.dt
-        return white + np.array([mean_of_sides(each**2) for each in rates]) * record.jitter**2
+        return white + _mean_of_sides(rates**2) * record.jitter**2
 
     def _joint(self, slopes: FloatArray, errors: FloatArray, n: int) -> FloatArray:
         """Information of n coordinates and unknown starts together.
@@ -243,3 +242,10 @@ def without_starts(joint: FloatArray, n_free: int) -> FloatArray:
         return alone
     left: FloatArray = alone - cross @ pinvh(others) @ cross.T
     return left
+
+
+def _mean_of_sides(between: FloatArray) -> FloatArray:
+    """Of what is between samples, (n, n_samples - 1, ...), the mean of both sides of each."""
+    sides = np.concatenate([between[:, :1], between, between[:, -1:]], axis=1)
+    mean: FloatArray = 0.5 * (sides[:, :-1] + sides[:, 1:])
+    return mean

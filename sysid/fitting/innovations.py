@@ -131,7 +131,7 @@ class Innovations(Objective):
         quiet: bool = False,
         near: FloatArray | None = None,
     ) -> Self:
-        """An objective's counterpart; near: (n_free,), where states react as they do."""
+        """An objective's counterpart; near: (n_free,), where free runs tell of motion between samples."""
         variant = cls.__new__(cls)
         vars(variant).update(vars(objective))
         variant.colour = [np.zeros(len(r.input_noise)) for r in objective.records]
@@ -146,7 +146,7 @@ class Innovations(Objective):
             parts = [denoised(record) for record in variant.records]
             variant.records, variant.colour = [q.record for q in parts], [q.colour for q in parts]
         variant.noise = variant.error = np.maximum(noise, _TINY)
-        variant.scatter = [scatter(record) for record in variant.records]
+        variant.scatter = variant._scatters(near)
         variant.trust = _full(variant.records)
         variant.corrects, variant.exact, variant.shape = corrects, False, None
         variant.coarseness, variant.least = 1.0, 1
@@ -309,6 +309,20 @@ class Innovations(Objective):
             with_reactions(model, record, vector, start[0])
             for record, start in zip(self.records, starts, strict=True)
         ]
+
+    def _scatters(self, chromosome: FloatArray | None) -> list[FloatArray]:
+        """Per record, (n_samples, n_outputs), by free runs at a chromosome, (n_free,), if any."""
+        if chromosome is None:
+            return [scatter(record) for record in self.records]
+        vector = self.space.full(chromosome[None])[0]
+        starts = self._starts(chromosome[None])
+
+        def by_run(record: Dataset, start: FloatArray) -> FloatArray:
+            return scatter(
+                record, lambda r: self.simulator.trajectories(vector, r, starts=start)[0]
+            )
+
+        return [by_run(*pair) for pair in zip(self.records, starts, strict=True)]
 
     def settled(self, chromosome: FloatArray) -> Self:
         """With the noise that the innovations show at a chromosome, (n_free,)."""

@@ -1,5 +1,6 @@
 """Means over windows as a filter takes them in: each once, in the sample in which it ends."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,11 @@ _INSIDE = 1e-3  # samples behind the end of a sample where a window that is cut 
 # that may overlap more.
 _OVERLAP, _FEW = 1.0, 0.05
 # Of the mean square of the slopes around, which that beside a mean is taken for at least: where it
-# seems to rest, between two turns, it does not.
-_AROUND = 0.25
+# seems to rest, between two turns, it does not. Means on each side that are around it.
+_AROUND, _NEAR = 0.05, 3
+_WIDE = 10  # the same of those by which a run is judged
+
+Run = Callable[[Dataset], FloatArray]  # outputs (n_samples, n_outputs) of a record's inputs
 
 
 def each_mean_once(record: Dataset) -> Dataset:
@@ -71,12 +75,13 @@ def _apart(begins: FloatArray, ends: IntArray) -> FloatArray | None:
     return begins
 
 
-def scatter(record: Dataset) -> FloatArray:
+def scatter(record: Dataset, run: Run | None = None) -> FloatArray:
     """Variances (n_samples, n_outputs) that the jitter of the windows makes of their means.
 
     By how fast an output changes to the means before and behind each, as measured, without what
-    the jitter itself does to that: a free run changes by the noise of its inputs as well. Not by
-    the slope from one neighbour to the other, which is none where a speed has its peak.
+    the jitter itself does to that. Not by the slope from one neighbour to the other, which is none
+    where a speed has its peak. run: of a model, to tell how an output bends in between. What noise
+    of the inputs and wrong parameters make of it changes slowly, and shows in what was measured.
 
     >>> windows = np.tile([-1.0, 0.0], (4, 1, 1))
     >>> ramp = Dataset(np.ones(4), [1, 3, 5, 7], 1.0, windows=windows, jitter=np.full((4, 1), 0.1))
@@ -88,38 +93,62 @@ def scatter(record: Dataset) -> FloatArray:
     variances = np.zeros(record.outputs.shape)
     if not (record.windows.size and record.jitter.any()):
         return variances
+    means, slopes = _of_run(record, run) if run is not None else (variances, variances)
     for j in np.flatnonzero(record.windows.any(axis=(0, 2))).tolist():
         rows, firsts, spans = _distinct(record, j)
         if len(firsts) < 2:
             continue
-        apart = np.maximum(record.dt * np.diff(spans[firsts].mean(axis=1)), _SAME * record.dt)
         jitter, counts = record.jitter[rows, j], np.diff(np.append(firsts, len(rows)))
-        squares = jitter[firsts] ** 2 / counts
-        changes = np.diff(record.outputs[rows[firsts], j]) ** 2
-        slopes = changes / (apart**2 + squares[1:] + squares[:-1])
-        slopes = np.maximum(mean_of_sides(slopes), _AROUND * _mean_around(slopes))
+        apart = np.maximum(record.dt * np.diff(spans[firsts].mean(axis=1)), _SAME * record.dt)
+        in_time = jitter[firsts] ** 2 / counts
+        excess = 1.0 + (in_time[1:] + in_time[:-1]) / apart**2
+        distinct, measured = rows[firsts], record.outputs[rows[firsts], j]
+        plain = np.diff(measured) / apart
+        beside = np.diff(measured - means[distinct, j]) / apart
+        with_run = _squares(slopes[distinct, j], beside, excess)
+        straighter = _bend(beside) < _bend(plain)
+        squares = np.where(straighter, with_run, _squares(np.zeros(len(distinct)), plain, excess))
+        squares = np.maximum(squares, _AROUND * _around(squares, _NEAR))
         place = np.searchsorted(firsts, np.arange(len(rows)), side="right") - 1
-        variances[rows, j] = slopes[place] * jitter**2
+        variances[rows, j] = squares[place] * jitter**2
     return variances
 
 
-def _mean_around(between: FloatArray) -> FloatArray:
-    """As ``mean_of_sides`` the mean of three on each side, (n - 1,) to (n,)."""
-    padded = np.pad(between, 3, mode="edge")
-    mean: FloatArray = np.convolve(padded, np.full(6, 1.0 / 6.0), "valid")
-    return mean
-
-
-def mean_of_sides(between: FloatArray) -> FloatArray:
-    """Of what is between neighbours, (n - 1, ...), the mean of both sides of each, (n, ...).
-
-    >>> mean_of_sides(np.array([4.0, 2.0]))
-    array([4., 3., 2.])
-    """
-    mean: FloatArray = 0.5 * (
-        np.concatenate([between[:1], between]) + np.concatenate([between, between[-1:]])
+def _of_run(record: Dataset, run: Run) -> tuple[FloatArray, FloatArray]:
+    """Means of a run, and how fast they change as windows move, (n_samples, n_outputs) each."""
+    jitter = record.jitter[..., None]
+    early, late = (
+        run(replace(record, windows=record.windows + moved)) for moved in (-jitter, jitter)
     )
-    return mean
+    slopes = np.zeros(early.shape)
+    np.divide(late - early, 2.0 * record.jitter, out=slopes, where=record.jitter > 0.0)
+    return run(record), slopes
+
+
+def _squares(slopes: FloatArray, chords: FloatArray, excess: FloatArray) -> FloatArray:
+    """Mean squares, (n,), of the slopes to both sides: of a run, (n,), and of what is beside it.
+
+    chords: (n - 1,), of that from each to the next; excess: (n - 1,), by which factor squares are
+    too large for the jitter.
+    """
+    before, behind = (slopes[1:] + chords) ** 2 / excess, (slopes[:-1] + chords) ** 2 / excess
+    squares: FloatArray = 0.5 * (np.append(behind[0], before) + np.append(behind, before[-1]))
+    return squares
+
+
+def _bend(chords: FloatArray) -> FloatArray:
+    """Mean square around each, (n,), of how chords (n - 1,) change to the next."""
+    bends = np.pad(np.diff(chords) ** 2, 1, mode="edge") if len(chords) > 1 else np.zeros(2)
+    return _around(bends, _WIDE)
+
+
+def _around(values: FloatArray, reach: int) -> FloatArray:
+    """Means of each, (n,), and so many on each side."""
+    width = 2 * reach + 1
+    means: FloatArray = np.convolve(
+        np.pad(values, reach, mode="edge"), np.full(width, 1.0 / width), "valid"
+    )
+    return means
 
 
 def _distinct(record: Dataset, output: int) -> tuple[IntArray, IntArray, FloatArray]:

@@ -184,6 +184,32 @@ def test_jitter_of_windows_counts_by_how_fast_an_output_changes():
     assert 0.97 < np.mean(np.mean(variances, axis=0) / expected) < 1.03
 
 
+def test_a_run_tells_how_outputs_bend_between_means():
+    """Means of a swing seven samples long, drawn anew; the run of it drifts and is a tenth off."""
+    n, deviation, turning = 200, 0.25 * DT, 2.0 * np.pi / (7.3 * DT)
+    t, rng = DT * np.arange(n), np.random.default_rng(0)
+
+    def means(windows):
+        begin, end = (t[:, None] + windows[:, 0]).T
+        return (np.cos(turning * begin) - np.cos(turning * end)) / (turning * (end - begin))
+
+    def run(record):
+        return (1.1 * means(record.windows) + 0.5 * t / t[-1])[:, None]
+
+    before = np.tile([-0.4 * DT, -0.2 * DT], (n, 1, 1))
+    jitter, parts = np.full((n, 1), deviation), []
+    for _ in range(200):
+        measured = means(before + deviation * rng.standard_normal((n, 1, 1)))
+        record = Dataset(np.ones(n), measured, DT, windows=before, jitter=jitter)
+        errors = (measured - means(before))[4:-4] ** 2
+        variances = (scatter(record, by)[4:-4, 0] for by in (run, None))
+        parts.append([[np.mean(errors / s), np.mean(np.log(s))] for s in variances])
+    (squares, logarithms), of_measured = np.mean(parts, axis=0)
+    assert 0.85 < squares < 1.15
+    # And closer to each error's own: chords are steep where the swing has its peaks.
+    assert squares + logarithms < np.sum(of_measured) - 0.3
+
+
 def test_a_part_keeps_its_windows():
     record = replace(averaged_step(), jitter=np.linspace(0.0, 1e-3, N)[:, None])
     part = record.part(50, 90, "part")
