@@ -10,7 +10,7 @@ Figures: geometric mean of the ratio of the intervals' widths (of a quantity tha
 bound the ratio counts none), the widest interval, how many hold the truth, and achieved over
 predicted deviations; of each round the same on standard error as it ends, with the runs that
 limits stopped and seconds of processor time. --keep: where the characterisations stay, one folder
-a rig; one that is there is gone on with.
+a rig; one that is there is gone on with, and so is one that a limit has stopped.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import yaml
 from benchmarks._common import arguments, prbs_logs, report
 from daq.characterise import characterise
 from daq.characterise.rounds import Interval, Round, rounds_of
+from daq.errors import InterlockError
 from daq.identification.fit import fit
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
@@ -123,14 +124,21 @@ def _characterised(
     """A rig's characterisation, gone on with where it has begun, and figures of its rounds."""
     root = folder / "c"
     told = _Rounds(root, hidden_values(number, name))
-    if root.exists():
-        designed = characterise.resume(root, watch=told.watch)
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
-        rig = _rig_file(folder, number, hidden_parameters(number))
-        designed = characterise.characterise(rig, seconds, None, root, model=name, watch=told.watch)
-    told.tell(designed.rounds)
-    return designed, told.figures
+    folder.mkdir(parents=True, exist_ok=True)
+    rig = _rig_file(folder, number, hidden_parameters(number))
+    while True:
+        try:
+            if root.exists():
+                designed = characterise.resume(root, watch=told.watch)
+            else:
+                designed = characterise.characterise(
+                    rig, seconds, None, root, model=name, watch=told.watch
+                )
+        except InterlockError as error:  # as a person would who reads what stopped it
+            print(error, file=sys.stderr, flush=True)
+            continue
+        told.tell(designed.rounds)
+        return designed, told.figures
 
 
 def round_figures(done: Round, values: Mapping[str, float]) -> dict[str, Any]:

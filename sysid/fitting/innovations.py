@@ -131,7 +131,7 @@ class Innovations(Objective):
         quiet: bool = False,
         near: FloatArray | None = None,
     ) -> Self:
-        """An objective's counterpart; near: (n_free,), where free runs tell of motion between samples."""
+        """An objective's counterpart; near: (n_free,), whose free runs tell of the motion."""
         variant = cls.__new__(cls)
         vars(variant).update(vars(objective))
         variant.colour = [np.zeros(len(r.input_noise)) for r in objective.records]
