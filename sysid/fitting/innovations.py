@@ -50,7 +50,7 @@ _FARTHEST = 2.3  # change of its logarithm that two rounds may foretell
 # of the inputs explains more than there is to explain.
 _LEAST_NOISE, _NEAR = 1e-2, 0.1
 _LEAST_OF_FILTER = 1e-4
-_TENTH, _PART_OF_TENTH = 0.1, 0.3
+_TENTH, _PART_OF_TENTH = 0.1, 0.15
 _BY_CHANCE = 3.0  # deviations
 _WHITE = 1.05  # ratio of what third and fifth differences show, below which it is white noise
 _TINY = 1e-300
