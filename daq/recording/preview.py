@@ -13,7 +13,7 @@ from daq.experiment import ClosedLoop, Evidence, Experiment, Plan, TripLimits
 from daq.files import write_whole
 from daq.hal import CHANNELS, Disclosing, FloatArray
 from daq.logs.columns import UNITS
-from daq.progress import Watch, ignore
+from daq.progress import Event, Note, Watch, ignore
 from daq.recording.session import Session, open_session
 from daq.run.protocol import evidence_of, preview_of
 from daq.views import Shown
@@ -45,7 +45,8 @@ class ChannelFacts:
 class Preview(Shown):
     """A session that has been checked, and what its plan does to each channel.
 
-    evidence: what simulated trials say, where they were asked for and can be made.
+    evidence: what simulated trials say, where they were asked for and can be made. warnings: what a
+    user must know of the rig's limits and the connection.
 
     >>> from daq import check
     >>> preview = check("prbs.yaml")
@@ -56,6 +57,7 @@ class Preview(Shown):
     session: Session
     channels: dict[str, ChannelFacts]
     evidence: Evidence | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def headline(self) -> str:
@@ -123,6 +125,7 @@ class Preview(Shown):
             "rig": self.session.rig.name,
             **({} if self.evidence is None else {"trials": _trials(self.evidence)}),
             "cannot_promise": [caveat.text for caveat in self.caveats],
+            "warnings": list(self.warnings),
         }
 
 
@@ -144,11 +147,18 @@ def check(
     >>> check("prbs.yaml").seconds
     1.25
     """
-    name = None if rig is None else str(rig)
-    session = open_session(str(experiment), name, port, watch=watch, to_run=False)
+    name, warnings = None if rig is None else str(rig), list[str]()
+
+    def tell(event: Event) -> None:
+        if isinstance(event, Note) and event.level == "warning":
+            warnings.append(event.text)
+        watch(event)
+
+    session = open_session(str(experiment), name, port, watch=tell, to_run=False)
     settings = session.loaded.experiment
     channels = {name: _facts(session.plan, session.rig, settings, name) for name in CHANNELS}
-    return Preview(session, channels, _evidence(session, draws, watch) if draws else None)
+    evidence = _evidence(session, draws, tell) if draws else None
+    return Preview(session, channels, evidence, tuple(warnings))
 
 
 def _evidence(session: Session, draws: int, watch: Watch) -> Evidence | None:

@@ -14,7 +14,7 @@ from scipy.signal import periodogram
 from daq.config.rig import RigConfig
 from daq.lookup.experiments import load_experiment
 from daq.recording.preview import spectral_lines
-from tests.daq.support import RIG, environment, forked_rig, write_experiment
+from tests.daq.support import RIG, environment, forked_rig, write_experiment, write_rig
 from tests.soak import mostly_soak
 
 LOOP = '''
@@ -88,6 +88,15 @@ def test_a_multisine_is_stated_without_its_ramps(command, tmp_path):
     assert stated["resolution_hz"] == 0.5
     assert f"crest factor {motor['crest_factor']:.3f}" in stated["remarks"][1]
     assert motor["power_band_hz"][0] >= 1.0 and motor["power_band_hz"][1] <= 99.0
+
+
+def test_machines_hear_of_limits_that_protect_nothing(command, tmp_path):
+    for speed, count in ((190.0, 0), (191.0, 1)):
+        limits, amplifiers = {"speed": speed}, {"motor": 0.5, "speed": 95.0}
+        write_rig(tmp_path / "rig.yaml", amplifiers=amplifiers, limits=limits)
+        result = command(["check", "still.yaml", "--rig", "rig.yaml", "--json"], tmp_path)
+        warnings = json.loads(result.stdout)["warnings"]
+        assert len(warnings) == count and all("limits.speed: 191" in text for text in warnings)
 
 
 def test_the_next_command_can_be_typed_as_it_stands(command, tmp_path):
