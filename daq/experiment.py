@@ -157,7 +157,7 @@ class Experiment(Section, abc.ABC):
     model: str = Field(
         "",
         max_length=400,
-        description="model that rig run --identify fits, where neither command nor file names one",
+        description="model that its runs identify, where neither command nor file names one",
     )
     sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
     calibration: OffsetCalibration = Field(OffsetCalibration(), description="offset calibration")

@@ -152,7 +152,8 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
     >>> len(result.campaign.outcomes), result.table.name
     (2, 'campaign.csv')
     """
-    problems = problems_of(wanted.settings, distinct(wanted.models), watch)
+    logs = [*wanted.logs, *wanted.validate]
+    problems = problems_of(wanted.settings, distinct(wanted.models), watch, logs=logs)
     seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
     now = datetime.datetime.now(datetime.UTC)
     folder = wanted.out or Path("campaigns") / f"{now:%Y%m%dT%H%M%SZ}"

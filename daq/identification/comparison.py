@@ -167,7 +167,8 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     """
     if wanted.seeds is not None and wanted.settings.options.get("seed") is not None:
         raise ConfigError("--seed and --seeds: give one of them")
-    problems = problems_of(wanted.settings, distinct(wanted.models), watch)
+    logs = [*wanted.logs, *wanted.validate]
+    problems = problems_of(wanted.settings, distinct(wanted.models), watch, logs=logs)
     seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
     alone = len(problems) == 1 and not wanted.baselines
     name = problems[0].model.name if alone else "comparison"

@@ -78,8 +78,10 @@ def identify(
     """
     typed = [f"{key}={json.dumps(value)}" for key, value in settings.items()]
     file = None if config is None else str(config)
-    problem = problem_of(SettingsRequest(file, {"model": model}, typed), watch)
-    return fit(problem, _as_sources(logs), _as_sources(validate), None, watch)
+    training, validation = _as_sources(logs), _as_sources(validate)
+    request = SettingsRequest(file, {"model": model}, typed)
+    problem = problem_of(request, watch, logs=_paths([*training, *validation]))
+    return fit(problem, training, validation, None, watch)
 
 
 def identify_files(

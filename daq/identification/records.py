@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -12,18 +13,19 @@ import numpy.typing as npt
 
 from daq.config.identification import Column, Columns, TimeColumn
 from daq.config.yaml_file import YamlFile
-from daq.errors import ConfigError, suggestion
+from daq.errors import ConfigError, Mistake, suggestion
 from daq.hal import FloatArray, IntArray
 from daq.identification.foreign import TIME_UNIT, ColumnMapping, read_foreign
 from daq.identification.selection import EVERYTHING, Selection
 from daq.logs import matlab
-from daq.logs.capture import LOG_NAME
+from daq.logs.capture import LOG_NAME, RUN_NAME
 from daq.logs.columns import COLUMNS, ORIGINAL_COLUMNS
 from daq.logs.encoder import SPEED, MeanSpeeds
-from daq.logs.recording import Recording, end_of_run, log_path, read_record
+from daq.logs.recording import Recording, end_of_run, log_path, read_record, settings_of
 from daq.logs.recording import load as load_recording
 from daq.logs.table import column_names
 from daq.logs.time_base import refuse_rows, require_rows, time_base
+from daq.lookup.models import DEFAULT_MODEL, find_model, name_parts
 from daq.views import Shown
 from sysid.problem.data import Dataset
 from sysid.problem.faults import mended
@@ -87,6 +89,36 @@ def expand(path: Path) -> list[Path]:
         return [capture for capture in captures if _begun(capture / LOG_NAME)] or captures
     problem = "neither a capture folder (with log.csv) nor a folder of CSV files or captures"
     raise ConfigError(problem, file=path)
+
+
+def intended_model(paths: Iterable[Path]) -> str | None:
+    """Installed model that the experiments of runs are for; None where they name none.
+
+    Logs of other programs say nothing. Raises ConfigError where runs are for different models, and
+    for a Python file, which a run's record is not to choose.
+    """
+    runs: dict[str, Path] = {}
+    for csv in (log_path(log) for path in paths for log in expand(path)):
+        experiment, _ = settings_of(read_record(csv) or {})
+        if experiment:
+            runs.setdefault(str(experiment.get("model") or DEFAULT_MODEL), csv.parent)
+    if len(runs) > 1:
+        each = ", ".join(f"{name} ({run})" for name, run in runs.items())
+        cure = "name one with --model, or identify them apart"
+        raise ConfigError(
+            f"the experiments of these runs are for different models: {each}", cure=cure
+        )
+    for name, run in runs.items():
+        place = Mistake("", file=run / RUN_NAME, key="model")
+        if name_parts(name)[1] is not None:
+            cure = "look at that file, then name it with --model"
+            problem = f"the experiment is for {name}, which would be run as a program"
+            raise ConfigError.of([replace(place, problem=problem, cure=cure)])
+        try:
+            find_model(name)
+        except ConfigError as error:
+            raise ConfigError.of(mistake.behind(place) for mistake in error.mistakes) from None
+    return next(iter(runs), None)
 
 
 def _begun(log: Path) -> bool:

@@ -15,6 +15,7 @@ from daq.config.yaml_file import Key, TypedSettings, YamlFile
 from daq.errors import ConfigError, Mistake, suggestion, together
 from daq.identification import datasheets, stages
 from daq.identification.foreign import ColumnMapping, check_columns, check_mapping
+from daq.identification.records import intended_model
 from daq.identification.request import SettingsRequest
 from daq.identification.selection import EVERYTHING, KEYS, Selection
 from daq.logs.recording import log_path
@@ -88,7 +89,7 @@ def problem_of(
     """Read and check settings and model; ConfigError names file, line, key and cure.
 
     record: which the request comes from, and whose files of models are not to be run. logs: whose
-    columns are looked for as well.
+    columns are looked for as well, and whose experiments name the model where nothing else does.
     """
     return problems_of(request, [request.options.get("model")], watch, record, logs)[0]
 
@@ -100,7 +101,7 @@ def problems_of(
     record: Path | None = None,
     logs: Sequence[Path] = (),
 ) -> list[Problem]:
-    """The same settings for each of several models, None for the default one.
+    """The same settings for each of several models, None for that of the settings or the logs.
 
     Each takes the ranges, fixed values and the like that it has a name for; names that no model
     has are mistakes.
@@ -111,7 +112,7 @@ def problems_of(
     if written is not None:
         check.refuse_other_kind(written, "an identification's settings")
     file = TypedSettings.of(options, request.settings, written)
-    declared = _find_models(config, file, names, record)
+    declared = _find_models(config, file, names, record, logs)
     file, freed = _without_nulls(file, [model for model, _ in declared])
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     plain = [model for model, _ in declared]
@@ -313,11 +314,15 @@ def gassi_settings(problem: Problem) -> dict[str, Any]:
 
 
 def _find_models(
-    config: Path | None, file: TypedSettings, names: Sequence[str | None], record: Path | None
+    config: Path | None,
+    file: TypedSettings,
+    names: Sequence[str | None],
+    record: Path | None,
+    logs: Sequence[Path],
 ) -> list[tuple[ProcessModel, str]]:
     """Models and their whole names; when one is not found, the file's other mistakes as well."""
     try:
-        return [_find_model(config, file, name, record) for name in names]
+        return [_find_model(config, file, name, record, logs) for name in names]
     except ConfigError as error:
         if error.key == "model":
             check.validate(file, IdentificationConfig, others=error.mistakes)
@@ -325,9 +330,13 @@ def _find_models(
 
 
 def _find_model(
-    config: Path | None, file: TypedSettings, typed: str | None, record: Path | None
+    config: Path | None,
+    file: TypedSettings,
+    typed: str | None,
+    record: Path | None,
+    logs: Sequence[Path],
 ) -> tuple[ProcessModel, str]:
-    """A model and its whole name, from the command line or else the configuration."""
+    """A model and its whole name: of the command line, the configuration, or the logs' runs."""
     configured = file.content.get("model")
     if configured is not None and not isinstance(configured, str):
         check.validate(file, IdentificationConfig)
@@ -335,7 +344,7 @@ def _find_model(
     if typed is None and "model" in file.typed:
         typed = configured
     beside = config.parent if config is not None and typed is None else None
-    name = typed or configured or DEFAULT_MODEL
+    name = typed or configured or intended_model(logs) or DEFAULT_MODEL
     try:
         return find_model(name, beside, record), whole_name(name, beside)
     except ConfigError as error:

@@ -9,6 +9,8 @@ import pytest
 import yaml
 
 from daq import ConfigError, analyse, identify, replay, resume
+from daq.identification.request import SettingsRequest
+from daq.identification.settings import problem_of
 from daq.pytest_plugin import Replayer, SimulatedRig
 from tests.daq.support import (
     few_free,
@@ -84,6 +86,12 @@ def name_model(folder, name):
     path.write_text(yaml.safe_dump(content))
     (folder / "report.json").write_text("{}")
     return path
+
+
+def name_experiments_model(folder, name):
+    record = record_of(folder)
+    record["experiment"]["model"] = name
+    (folder / "run.json").write_text(json.dumps(record))
 
 
 def request_search(folder, **asked):
@@ -162,6 +170,31 @@ def test_the_model_of_a_search_that_was_interrupted(sent, tmp_path, asked):
     assert "search.json: model: this record names" in result.stderr
     trusted = rig("identify", "--resume", "sent", "--trust", cwd=tmp_path)
     assert "there is no checkpoint to continue from" in trusted.stderr and ran(sent)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("theirs.py:model", "the experiment is for theirs.py:model, which would be run as a "),
+        ("actuater", "unknown model 'actuater'; did you mean 'actuator'?"),
+    ],
+)
+def test_the_model_that_a_runs_experiment_names(sent, tmp_path, name, problem):
+    name_experiments_model(sent, name)
+    result = rig("identify", "sent", cwd=tmp_path)
+    assert result.returncode == 2 and result.stdout == ""
+    assert result.stderr.startswith(f"rig: sent/run.json: model: {problem}")
+    assert not ran(sent)
+
+
+def test_a_run_is_identified_by_the_model_that_its_experiment_names(sent, recorded):
+    name_experiments_model(sent, "actuator:friction=none")
+    assert problem_of(SettingsRequest(), logs=[sent]).model_name == "actuator:friction=none"
+    assert problem_of(SettingsRequest(), logs=[recorded]).model_name == "actuator"
+    typed = SettingsRequest(None, {"model": "actuator"})
+    assert problem_of(typed, logs=[sent]).model_name == "actuator"
+    with pytest.raises(ConfigError, match="for different models: actuator:friction=none"):
+        identify([sent, recorded])
 
 
 def test_in_python(sent, tmp_path):
