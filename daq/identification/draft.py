@@ -65,14 +65,15 @@ class Draft:
     ) -> Missing:
         """Have tests of what the model may lack begun where a fit ended; what gives the findings.
 
-        Where the other process has something left to do they are left to this one.
+        Where the other process has something left to do, or none are wanted, they are left to this.
         """
         from sysid.judging.examination import score_tests_of
 
         def here(uncertainty: Uncertainty) -> tuple[Finding, ...]:
             return score_tests_of(estimator, training).findings(uncertainty)
 
-        if not self._linear or not self._linear[0].is_answered:
+        free = self._linear and self._linear[0].is_answered
+        if estimator.averaged_inputs_ or not free:
             return here
         fit = pickle.dumps(problem.request), _without_models((estimator, list(training)))
         begun = self.second.call(_begun, *fit)

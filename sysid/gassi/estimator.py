@@ -44,6 +44,10 @@ _OVERWHELMED = (
     "since the noise of the measured inputs would explain more than all of the free run's error: "
     "what it does adds up over this record, and only the outputs tell it"
 )
+_AVERAGED = (
+    "; averages of them are taken, since their noise hides where the equations bend: it also moves "
+    "free runs too far for these to tell what the model may lack"
+)
 
 # Times the samples of a search in a record, beyond which a fit goes by parts as well: more of them
 # tell little more, and take the longer.
@@ -364,6 +368,8 @@ class GASSI(RecordEstimator):
             self.averaged_inputs_ = likeliest.objective.quiet
             if likeliest.objective.corrects and self.criterion_ == "compensated":
                 self.criterion_, self.criterion_reason_ = "innovations", _OVERWHELMED
+            if self.averaged_inputs_:
+                self.criterion_reason_ += _AVERAGED
 
     def _with_starts(
         self, objective: Objective, chromosomes: Sequence[FloatArray]

@@ -101,10 +101,16 @@ def suspected(
 ) -> Suspicion | None:
     """What the model may lack by the training records; None where that cannot be tested.
 
+    By free runs, and not where noise of the inputs moves these so far that a filter averages it.
     validation: on which a variant that is fitted must do no worse. missing: the findings of
     ``score_tests_of``, where these have been begun elsewhere.
     """
     if uncertainty is None:
+        return None
+    exchange = exchanged_channels(estimator, uncertainty, training)
+    if exchange is not None:
+        return Suspicion((exchange,), None)  # what else is found is of the wrong channels
+    if estimator.averaged_inputs_:
         return None
     try:
         tested = uncertainty
@@ -121,9 +127,6 @@ def suspected(
     findings = tuple(
         moved_by_noise(f, estimator, tested, training) if f.kind == "noise" else f for f in findings
     )
-    exchange = exchanged_channels(estimator, uncertainty, training)
-    if exchange is not None:
-        return Suspicion((exchange,), None)  # what else is found is of the wrong channels
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
     return Suspicion(findings, fitted)
 

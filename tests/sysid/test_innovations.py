@@ -30,6 +30,7 @@ from sysid.fitting.refinement import refine
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.likelihood import better_by_filter, noisy_fit, towards
 from sysid.gassi.optima import Optimum
+from sysid.judging.examination import verdict_of
 from sysid.uncertainty import uncertainty
 from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
@@ -491,6 +492,16 @@ def test_inputs_are_averaged_where_their_noise_hides_a_bend_and_not_else():
         for model, signal in ((lag(), np.copy), (BENT, np.abs))
     )
     assert bent.averaged_inputs_ and not straight.averaged_inputs_
+    assert "averages of them are taken" in bent.criterion_reason_
+    assert "averages" not in straight.criterion_reason_
+
+
+def test_what_a_model_may_lack_is_not_tested_where_noise_moves_free_runs_too_far():
+    record = slow_record(np.abs)
+    bent = GASSI(BENT, population=20, generations=8, criterion="innovations").fit(record)
+    verdict = verdict_of(bent, [record])
+    assert "What the model may lack was not tested." in verdict.notes
+    assert not any("The data ask for" in reason for reason in verdict.reasons)
 
 
 def test_innovations_count_by_what_noise_does_to_them_at_a_bend():
