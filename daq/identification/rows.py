@@ -20,6 +20,7 @@ LABELS = {  # of undetermined reasons
     "tied": "only together",
     "vague": "hardly felt",
     "rival": "two answers",
+    "end": "at its end",
     "": "",
 }
 

@@ -21,7 +21,6 @@ from sysid.problem.faults import data_faults
 from sysid.problem.model import ModelError, Parameter
 from sysid.threads import one_thread
 from sysid.uncertainty import Uncertainty
-from sysid.uncertainty.analysis import uncertainty as intervals
 
 _BEYOND = 10.0  # times its range, to where a parameter is freed that stands on an end of it
 
@@ -113,19 +112,18 @@ def suspected(
     if estimator.averaged_inputs_:
         return None
     try:
-        tested = uncertainty
         if any(p.pushed for p in uncertainty.parameters):
             # What an end of a range leaves looks like something missing.
             freed = _freed(estimator.final_objective(list(training)), estimator.final_chromosome_)
-            tested = intervals(*freed, profiled=range(len(freed[0].space.index)))
-            findings = missing_physics(*freed, tested)
+            findings = missing_physics(*freed, uncertainty)
         else:
             missing = missing or score_tests_of(estimator, training).findings
-            findings = missing(tested)
+            findings = missing(uncertainty)
     except ModelError:  # equations that cannot be added to, or a run that fails
         return None
     findings = tuple(
-        moved_by_noise(f, estimator, tested, training) if f.kind == "noise" else f for f in findings
+        moved_by_noise(f, estimator, uncertainty, training) if f.kind == "noise" else f
+        for f in findings
     )
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
     return Suspicion(findings, fitted)

@@ -18,7 +18,7 @@ from sysid.problem.ranges import Range, Tie, ties, with_search_range
 from sysid.time_limit import AT_A_POINT, time_limit
 
 # A search coordinate this close to an end of its range, in parts of the range, stands on it.
-_ON_BOUND = 1e-3
+ON_BOUND = 1e-3
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class SearchSpace:
     def on_bound(self, chromosome: FloatArray) -> BoolArray:
         """Which values of a chromosome (n_free,) stand on a bound of their range."""
         lower, upper = self.coded_bounds
-        near = _ON_BOUND * self.width
+        near = ON_BOUND * self.width
         at = self.encode(chromosome)
         return (at < lower + near) | (at > upper - near)
 

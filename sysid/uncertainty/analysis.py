@@ -18,6 +18,7 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
+from sysid.problem.space import ON_BOUND
 from sysid.uncertainty.colour import successive_correlation
 from sysid.uncertainty.covariance import covariance, larger
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
@@ -107,10 +108,11 @@ class Uncertainty:
         return correlation
 
     def of(self, places: Sequence[int], names: Sequence[str]) -> Self:
-        """The same of some of the coordinates, under other names."""
+        """The same of some of the coordinates, under other names; none of what others are in."""
         renamed = {
             self.parameters[place].name: name for place, name in zip(places, names, strict=True)
         }
+        left_out = {p.name for p in self.parameters} - {*renamed}
         return replace(
             self,
             parameters=tuple(
@@ -120,6 +122,11 @@ class Uncertainty:
                 replace(
                     a,
                     parameters=tuple(renamed[n] for n in a.parameters if n in renamed),
+                    determined=tuple(
+                        e
+                        for e in a.determined
+                        if e.combination is None or left_out.isdisjoint(e.combination.names)
+                    ),
                     measure=tuple(renamed[n] for n in a.measure if n in renamed),
                 )
                 for a in self.ambiguities
@@ -539,6 +546,8 @@ class _Analysis:
         positive = bool(np.all(self.space.log[gradient != 0.0])) and value > 0.0
         moved = gradient / value if positive else gradient
         quantity = Expression(self.space, combination, positive)
+        if self._wanted_beyond(quantity, moved):
+            return _Draft(replace(estimate, why="end"))
         tracer = Tracer(self.local, self.covariance, moved, quantity)
         narrow = np.isfinite(deviation) and (not positive or deviation < _WEAK * value)
         if not (narrow and self._arrived(gradient, deviation)):
@@ -549,6 +558,17 @@ class _Analysis:
         else:
             low, high = (value + sign * Z95 * deviation for sign in _SIDES)
         return _Draft(replace(estimate, std=deviation, low=float(low), high=float(high)), tracer)
+
+    def _wanted_beyond(self, quantity: Expression, gradient: FloatArray) -> bool:
+        """Whether the data push what changes so (n_free,) beyond what ranges of its members allow.
+
+        Of a parameter its one end tells that, and that it stands there; of a combination nothing.
+        """
+        place, near = quantity.at(self.coded), ON_BOUND * quantity.width
+        step, deviation = gradient @ self.free.newton_step, self.free.deviation(gradient)
+        outwards = -step if place < quantity.ends[0] + near else step
+        at_end = place < quantity.ends[0] + near or place > quantity.ends[1] - near
+        return bool(at_end and outwards > Z95 * deviation)
 
     def settled(self, drafts: Sequence[_Draft]) -> list[Estimate]:
         """Estimates with the ends that profiles tell.

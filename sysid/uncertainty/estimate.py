@@ -6,7 +6,7 @@ from typing import Literal, Protocol
 
 Z95 = 1.959963984540054  # of a normal distribution, two-sided 95 %
 
-Why = Literal["", "tied", "vague", "rival"]
+Why = Literal["", "tied", "vague", "rival", "end"]
 
 
 class Invariant(Protocol):
@@ -39,11 +39,11 @@ class Estimate:
     on a side where the data set no end within the range searched. std: standard deviation of an
     interval by the curvature at the value, None of one by the profile likelihood. why: empty,
     ``tied`` (it acts only together with other parameters), ``vague`` (the data set no end on
-    either side), or ``rival`` (it has another value in a rival minimum; the interval is that
-    around this one). on_bound: whether the value stands on an end of its range; pushed: whether
-    the data want it beyond. failing: share of
-    the range in which the model cannot be simulated, where that ends the interval. combination:
-    None of a parameter.
+    either side), ``rival`` (it has another value in a rival minimum; the interval is that around
+    this one), or ``end`` (a combination that the data want beyond what the ranges allow). on_bound:
+    whether the value stands on an end of its range; pushed: whether the data want it beyond.
+    failing: share of the range in which the model cannot be simulated, where that ends the
+    interval. combination: None of a parameter.
 
     >>> inertia = Estimate("J", "kg*m^2", 5.0, std=0.1, low=4.8, high=5.2)
     >>> inertia.excludes({"J": 4.9}), inertia.excludes({"J": 4.7})

@@ -719,6 +719,31 @@ def test_a_parameter_pushed_against_its_bound_counts_as_fixed_and_has_one_end():
     same_interval(parameters["a"], estimates(problem.tell(fixed={"b": 1.0}))["a"])
 
 
+@pytest.mark.parametrize(("ends", "why"), [((1.0, 2.0), ""), ((1.0, 1.2), "end")])
+def test_a_combination_that_the_data_want_beyond_its_ranges_has_no_interval(ends, why):
+    """The true product is 1.5; ranges of its factors end at 2 or at 1.2."""
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("a", 3.0), unknown("b", 0.5), unknown("c", 1.0)],
+    )
+    product = Formulated("a b", ("a", "b"), lambda a, b: a * b)
+    result = problem.tell(product, ranges={"a": ends, "b": (0.5, 1.0)})
+    (ambiguity,) = result.ambiguities
+    assert [e.why for e in ambiguity.determined] == [why]
+    assert ("a b" in {e.name for e in result.determined()}) == (not why)
+
+
+def test_of_some_coordinates_no_combination_with_others_is_left():
+    problem = Problem(
+        lambda p, u: columns(p["a"] * p["b"] * u[:, 0] + p["c"] * u[:, 1]),
+        [unknown("a", 3.0), unknown("b", 0.5), unknown("c", 1.0)],
+    )
+    result = problem.tell(Formulated("a b", ("a", "b"), lambda a, b: a * b))
+    names = [e.name for e in result.of([0, 1, 2], ["a", "b", "C"]).determined()]
+    assert names == ["C", "a b"]
+    assert [e.name for e in result.of([1, 2], ["b", "C"]).determined()] == ["C"]
+
+
 def test_what_does_nothing_is_hardly_felt():
     problem = Problem(
         lambda p, u: columns(p["a"] * u[:, 0]), [unknown("a", 2.0), unknown("idle", 1.0)]
