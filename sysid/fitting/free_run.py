@@ -20,6 +20,7 @@ _SHARE = 0.3  # of what is left of an output that they may be: more would show i
 # What is left of an output is no noise where errors of the steps do half of it, or so small.
 _OWN, _NOTHING = 2.0, 1e-6
 _FAR_MORE = 16  # times the steps that a search took, above which they would cost too much
+_TELLING = 8192  # samples that tell where a record starts: of later ones a simulation costs more
 
 
 def free_run(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
@@ -154,15 +155,17 @@ def _change_by_steps(objective: Objective, chromosome: FloatArray, steps: IntArr
 def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
     """Initial states (n_states,) of a record under parameters (n_parameters,).
 
-    States with an ``initial_range`` are fitted to the measured outputs by least squares.
+    States with an ``initial_range`` are fitted to the measured outputs by least squares, of a long
+    record to its beginning.
     """
     model = simulator.model
     declared = record.initial_state(model)
     space = SearchSpace.of_starts(model, vector, record)
-    weights = np.asarray(np.isfinite(record.outputs).any(axis=0), dtype=np.float64)
+    head = record.part(0, min(record.n_samples, _TELLING), record.name)
+    weights = np.asarray(np.isfinite(head.outputs).any(axis=0), dtype=np.float64)
     if not (space.estimated and weights.any()):
         return declared
-    objective = Objective(simulator, space, [record], weights=weights)
+    objective = Objective(simulator, space, [head], weights=weights)
     fitted = refine(objective, space.with_nominal_starts(np.empty(0))).chromosome
     start: FloatArray = space.starts(fitted[None], 0, declared)[0]
     return start

@@ -98,6 +98,15 @@ def test_the_start_is_the_least_squares_one():
     assert found == pytest.approx(float(slope @ rest / (slope @ slope)), abs=1e-4)
 
 
+def test_of_a_long_record_the_beginning_tells_the_start():
+    long = record(2.0, 3, n=10_000)
+    later = long.outputs.copy()
+    later[9000:] += 5.0
+    disturbed = replace(long, outputs=later)
+    found = estimate_start(BatchSimulator(chain()), np.array([1.7, 12.0]), disturbed)
+    assert found[0] == pytest.approx(2.0, abs=1e-3)
+
+
 def test_a_start_outside_its_range_ends_on_it():
     found = estimate_start(
         BatchSimulator(chain((-1.0, 1.0))), np.array([1.7, 12.0]), record(3.0, 1)
