@@ -168,7 +168,8 @@ def uncertainty(
     analysis = _Analysis(local, structure or ties(local), ridge)
     bottoms = [_Analysis(sensitivity(objective, point), analysis.ties) for point in ridge]
     others = list(analysis.unlike(rivals))
-    apart = [_Analysis(sensitivity(objective, rival), analysis.ties) for rival in others]
+    # A descent to a rival may have stopped short, by less than what is left open there.
+    apart = [_Analysis(sensitivity(objective, r), analysis.ties, away=Z95) for r in others]
     minima = [rival.as_rival() for rival in apart]
 
     def judged(estimate: Estimate) -> Estimate:
@@ -303,12 +304,20 @@ class _Draft:
 
 
 class _Analysis:
-    """Estimates and ambiguities: by the covariance, or where that is no guide by profiles."""
+    """Estimates and ambiguities: by the covariance, or where that is no guide by profiles.
+
+    away: deviations between an estimate and the minimum that slopes foretell, from where they are
+    no guide.
+    """
 
     def __init__(
-        self, local: Sensitivity, structure: Ties, ridge: Sequence[FloatArray] = ()
+        self,
+        local: Sensitivity,
+        structure: Ties,
+        ridge: Sequence[FloatArray] = (),
+        away: float = _AWAY,
     ) -> None:
-        self.local, self.ties = local, structure
+        self.local, self.ties, self.away = local, structure, away
         self.objective, self.space = local.objective, local.objective.space
         self.chromosome, self.coded = local.chromosome, self.space.encode(local.chromosome)
         self.ridge = [Fit(0.0, 0.0, self.space.encode(point), local.error) for point in ridge]
@@ -528,7 +537,7 @@ class _Analysis:
         step, curvature = self.covariance.newton_step, self.covariance.curvature
         held = np.flatnonzero(self.on_bound & (self._outwards(step) > 0.0))
         follows = curvature[:, held] @ np.linalg.pinv(curvature[np.ix_(held, held)])
-        return bool(abs(gradient @ (step - follows @ step[held])) < _AWAY * deviation)
+        return bool(abs(gradient @ (step - follows @ step[held])) < self.away * deviation)
 
     def _outwards(self, step: FloatArray) -> FloatArray:
         """A step's parts towards the nearer end of each range, (n_free,)."""

@@ -334,6 +334,24 @@ def test_minima_with_a_wall_between_them_are_rivals_each_with_an_interval():
     assert (low, high) == pytest.approx((-a.high, -a.low), rel=1e-3)
 
 
+@pytest.mark.parametrize(("short", "why"), [(0.0, ""), (1.0, ""), (4.0, "rival")])
+def test_a_rival_near_its_minimum_tells_how_far_a_quantity_of_both_may_be(short, why):
+    """Of k the minima are two deviations apart; a descent stopped so many short of the second."""
+
+    def formula(p, u):
+        return p["a"] ** 2 * u[:, 0] + (p["k"] + 0.0029 * p["a"]) * u[:, 1]
+
+    target, deviation = formula_objective(formula, {"a": 2.0, "k": 1.0}, -5.0, 5.0), 0.0058
+    best, rival = (refine(target, np.array([a, 1.0])).chromosome for a in (2.0, -2.0))
+    assert rival[1] - best[1] == pytest.approx(2.0 * deviation, rel=0.01)
+    rival[1] += short * deviation
+    a, k = uncertainty(target, best, [rival]).parameters
+    assert (a.why, k.why) == ("rival", why)
+    if not why:
+        assert k.low == pytest.approx(best[1] - 1.96 * deviation, abs=0.2 * deviation)
+        assert k.high == pytest.approx(rival[1] + 1.96 * deviation, abs=0.2 * deviation)
+
+
 def test_what_the_data_tell_apart_is_no_rival():
     model = oscillator(900.0, 300.0, 2000.0)
     fitted = GASSI(model, population=40, generations=10).fit(record_of(model, 0.01, noise=0.001))
