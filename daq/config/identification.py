@@ -37,6 +37,7 @@ def _ordered(ends: tuple[float | None, float | None]) -> tuple[float | None, flo
     return ends
 
 
+TermShape = Literal["sign", "linear", "square", "cube", "abs", "parabola", "sine", "stribeck"]
 Range = Annotated[tuple[Quantity | None, Quantity | None], AfterValidator(_ordered)]
 
 
@@ -237,9 +238,9 @@ class TermSetting(Section):
 
     equation: str = Field(description="the state to whose rate it is added", examples=["omega"])
     of: str = Field(description="the state or input that it is a function of", examples=["omega"])
-    shape: Literal["sign", "linear", "square", "cube", "abs", "parabola", "stribeck"] = Field(
+    shape: TermShape = Field(
         description="of z = (signal - centre) / scale: sign (in proportion where |z| < 1), linear, "
-        "square (z |z|), cube, abs, parabola (z^2) or stribeck (sign(z) exp(-z^2))"
+        "square (z |z|), cube, abs, parabola (z^2), sine or stribeck (sign(z) exp(-z^2))"
     )
     scale: float = Field(gt=0.0, description="in the signal's unit", examples=[0.05])
     centre: float = Field(0.0, description="in the signal's unit")

@@ -1,5 +1,6 @@
 """What score tests find: what a model lacks, how sure that is, what it moves, and in what words."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -135,4 +136,7 @@ def _term_text(term: AddedTerm) -> str:
         )
     if term.shape == "sign" and term.of == term.equation and term.centre == 0.0:
         return f"a term in the sign of {term.of} in {equation}, like dry friction"
+    if term.shape == "sine":
+        period = f"{2.0 * math.pi * term.scale:.3g}"
+        return f"a term in {equation} that repeats with {term.of} (every {period}), like cogging"
     return f"a term in {term.of} ({term.shape}) in {equation}"

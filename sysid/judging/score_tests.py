@@ -24,6 +24,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import noiseless
 from sysid.fitting.objective import Objective
+from sysid.judging.cycles import cycle_suspects
 from sysid.judging.disturbed import DisturbedRun, of_each
 from sysid.judging.findings import Finding, moves_of
 from sysid.judging.regression import Regressed, Regression
@@ -108,7 +109,8 @@ class ScoreTests:
         if self._exact:
             return []
         runs = self._runs
-        return [*function_suspects(runs), *curve_suspects(runs), *disturbance_suspects(runs)]
+        in_equations = [*function_suspects(runs), *cycle_suspects(runs)]
+        return [*in_equations, *curve_suspects(runs), *disturbance_suspects(runs)]
 
     def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
         """What the model lacks, the surest first, and how far it moves what has intervals."""
@@ -271,8 +273,12 @@ class _Tests:
                 }
                 surest = min(sized, key=lambda i: float(np.sum(sized[i][2] ** 2)))
                 changes[surest], result, residual = sized[surest]
-            term = self._term(suspects[surest], changes[surest], residual)
-            self.findings.append(self._finding(suspects[surest], result, logs[surest], term))
+            suspect = suspects[surest]
+            if suspect.closer is not None:
+                suspect, result, residual = self._closer(suspect, result, residual)
+                changes[surest] = suspect.changes / self._scales[..., None]
+            term = self._term(suspect, changes[surest], residual)
+            self.findings.append(self._finding(suspect, result, logs[surest], term))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -340,6 +346,19 @@ class _Tests:
         changes, test, delay = best
         return changes, replace(test, amplitudes=np.array([delay])), self._left(changes, test)
 
+    def _closer(
+        self, suspect: Suspect, result: Regressed, residual: FloatArray
+    ) -> tuple[Suspect, Regressed, FloatArray]:
+        """Of a suspect and those beside it the one that explains most, and what it leaves."""
+        assert suspect.closer is not None
+        regression = self._coloured_by(residual)
+        best = suspect, result
+        for beside in suspect.closer():
+            test = regression.test(beside.changes / self._scales[..., None], suspect.one_sided)
+            if test is not None and test.share > best[1].share:
+                best = beside, test
+        return *best, self._left(best[0].changes / self._scales[..., None], best[1])
+
     def settled(self) -> tuple[Finding, ...]:
         """The findings, with what each explains by the colour that all of them leave.
 
@@ -366,6 +385,11 @@ class _Tests:
     ) -> AddedTerm | None:
         """The term of a suspect that by itself explains most; residual: what all leave."""
         regression = self._coloured_by(residual)
+        if suspect.terms and suspect.terms[0].shape == "sine":
+            both = regression.test(changes, False)
+            return (
+                suspect.terms[0] if both is None else _of_phase(suspect.terms[0], both.amplitudes)
+            )
         alone = [
             (result.share, float(np.abs(result.amplitudes[0])), term)
             for k, term in enumerate(suspect.terms)
@@ -374,8 +398,7 @@ class _Tests:
         if not alone:
             return suspect.terms[0] if suspect.terms else None
         _, size, term = max(alone, key=lambda test: test[0])
-        reach = float(f"{_REACH * size:.1g}") or 1.0
-        return replace(term, low=-reach, high=reach)
+        return _with_reach(term, size)
 
     def _finding(
         self, suspect: Suspect, result: Regressed, log_p: float, term: AddedTerm | None
@@ -393,6 +416,20 @@ class _Tests:
             term,
             suspect.of_input,
         )
+
+
+def _of_phase(sine: AddedTerm, amplitudes: FloatArray) -> AddedTerm:
+    """The sine that one and a cosine of these amplitudes make together."""
+    phase = float(np.arctan2(amplitudes[1], amplitudes[0]))
+    centre = sine.centre - phase * sine.scale
+    term = replace(sine, scale=float(f"{sine.scale:.4g}"), centre=float(f"{centre:.3g}"))
+    return _with_reach(term, float(np.hypot(*amplitudes)))
+
+
+def _with_reach(term: AddedTerm, size: float) -> AddedTerm:
+    """A term with a range for what its test found to be so large."""
+    reach = float(f"{_REACH * size:.1g}") or 1.0
+    return replace(term, low=-reach, high=reach)
 
 
 def _gradient(local: Sensitivity, estimate: Estimate) -> FloatArray:

@@ -64,7 +64,8 @@ class Suspect:
     name: of the channel, the variant, or the equation. terms: of functions, one for each amplitude,
     their ranges those of one unit. changes: (n_rows, n_outputs, n_amplitudes), records one after
     another, in the outputs' units. late: of a delay or a filter, the change by so many seconds of
-    it: where outputs jump that by a little is no guide. of_input: whether a channel is an input.
+    it: where outputs jump that by a little is no guide. closer: the same of sizes beside its own,
+    where those that are tested are far apart. of_input: whether a channel is an input.
     """
 
     kind: Kind
@@ -74,6 +75,11 @@ class Suspect:
     terms: tuple[AddedTerm, ...] = ()
     late: Callable[[float], FloatArray] | None = None
     of_input: bool = False
+    closer: Callable[[], "Sequence[Suspect]"] | None = None
+
+    def with_closer(self, closer: Callable[[], "Sequence[Suspect]"]) -> "Suspect":
+        """The same, of which such are beside it."""
+        return replace(self, closer=closer)
 
     @property
     def one_sided(self) -> bool:
@@ -382,7 +388,7 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """
     model = runs[0].model
     signals: list[State | Input] = [*model.states, *model.inputs]
-    for i in _physical_equations(runs[0]):
+    for i in physical_equations(runs[0]):
         state = model.states[i]
         for j, signal in enumerate(signals):
             together = np.concatenate([_signal(run, j) for run in runs])
@@ -390,7 +396,7 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             if len(np.unique(together)) < _LEVELS or (_jumps(together) and not held):
                 continue
             for terms in _terms(state.name, signal.name, together):
-                columns = [_added(runs, i, partial(_term_along, term, j, held)) for term in terms]
+                columns = [added(runs, i, partial(_term_along, term, j, held)) for term in terms]
                 unit = f"{state.unit}/s"
                 yield Suspect("function", state.name, unit, np.stack(columns, axis=2), terms)
 
@@ -437,6 +443,8 @@ def _values(term: AddedTerm, signal: FloatArray) -> FloatArray:
         return -np.sign(z) * np.exp(-(z**2))
     if term.shape == "abs":
         return np.abs(z)
+    if term.shape == "sine":
+        return np.sin(z)
     return {"linear": z, "square": z * np.abs(z), "cube": z**3, "parabola": z**2}[term.shape]
 
 
@@ -457,9 +465,9 @@ def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     waves = [
         wave for k in _PERIODS for wave in (partial(_wave, np.sin, k), partial(_wave, np.cos, k))
     ]
-    for i in _physical_equations(runs[0]):
+    for i in physical_equations(runs[0]):
         state = runs[0].model.states[i]
-        columns = [_added(runs, i, wave) for wave in waves]
+        columns = [added(runs, i, wave) for wave in waves]
         yield Suspect("disturbance", state.name, f"{state.unit}/s", np.stack(columns, axis=2))
 
 
@@ -495,14 +503,14 @@ def _signal(run: DisturbedRun, j: int) -> FloatArray:
     return run.states[:, j] if j < n else run.record.inputs[:, j - n]
 
 
-def _added(
+def added(
     runs: Sequence[DisturbedRun], i: int, signal: Callable[[DisturbedRun], FloatArray]
 ) -> FloatArray:
     """Changes by a signal (n_samples,) of each run that is added to equation i."""
     return of_each(runs, lambda run: run.added(_column(run.states, i, signal(run))))
 
 
-def _physical_equations(run: DisturbedRun) -> list[int]:
+def physical_equations(run: DisturbedRun) -> list[int]:
     """Equations in which a parameter acts: an angle is the integral of its speed and no more."""
     few: Any = np.linspace(0, run.record.n_samples - 1, _POINTS).astype(np.int64)
     rates = _rates_at(run, np.unique(few))

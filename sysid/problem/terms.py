@@ -10,7 +10,7 @@ from sysid.problem.extension import extended
 from sysid.problem.model import Function, ModelError, Parameter, ProcessModel
 from sysid.problem.shapes import dry_friction
 
-Shape = Literal["sign", "linear", "square", "cube", "abs", "parabola", "stribeck"]
+Shape = Literal["sign", "linear", "square", "cube", "abs", "parabola", "sine", "stribeck"]
 
 _STICKS = 0.01  # of a Stribeck speed, below which it grows from zero
 
@@ -20,8 +20,8 @@ class AddedTerm:
     """What is added to a state's rate: a parameter times a shape of z = (signal - centre) / scale.
 
     equation: the state. of: the signal, a state or an input. shape: ``sign`` (in proportion where
-    abs(z) < 1), ``linear``, ``square`` (z abs(z)), ``cube``, ``abs``, ``parabola`` (z^2) or
-    ``stribeck`` (sign(z) exp(-z^2)).
+    abs(z) < 1), ``linear``, ``square`` (z abs(z)), ``cube``, ``abs``, ``parabola`` (z^2),
+    ``sine`` or ``stribeck`` (sign(z) exp(-z^2)).
     scale, centre: in the signal's unit. low, high: range of the parameter, in the unit of the rate.
 
     >>> AddedTerm("omega", of="omega", shape="sign", scale=0.05, low=-500.0, high=500.0).parameter
@@ -132,5 +132,6 @@ _SHAPES: dict[Shape, Callable[[Any], Any]] = {
     "cube": lambda z: z * z * z,
     "abs": abs,
     "parabola": lambda z: z * z,
+    "sine": math.sin,
     "stribeck": lambda z: dry_friction(z, _STICKS) * math.exp(-z * z),
 }

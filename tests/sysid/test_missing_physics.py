@@ -116,6 +116,51 @@ def test_a_sensor_that_bends_is_named():
     assert "a curve between omega and what is logged of it" in " ".join(verdict.parameters.reasons)
 
 
+PITCH = 0.024
+DRIVE = ProcessModel(
+    name="drive",
+    states=(State("x", "m"), State("v", "m/s")),
+    inputs=(Input("u", "V"),),
+    outputs=(Output("x", "m"), Output("v", "m/s")),
+    parameters=(
+        Parameter("gain", "m/(V*s^2)", 20.0, 2.0, 200.0, "log"),
+        Parameter("damping", "1/s", 10.0, 1.0, 100.0, "log"),
+    ),
+    derivative=lambda x, u, p: (x[1], p[0] * u[0] - p[1] * x[1]),
+)
+
+
+def drive_log(cogging, seed=0, n=1200, dt=2e-3):
+    """A linear drive over the magnets of its track, which pull it along and back, by SciPy."""
+    rng, turning = np.random.default_rng(seed), 2.0 * np.pi / PITCH
+    inputs = np.repeat(rng.uniform(-1.0, 1.0, n // 25), 25)[:, None]
+
+    def derivative(x, u, p):
+        pull = cogging * np.sin(turning * x[0] + 0.7)
+        return x[1], 22.0 * u[0] - 9.0 * x[1] + pull
+
+    real = replace(DRIVE, derivative=derivative)
+    exact = simulate(real, np.ones(2), Dataset(inputs, np.zeros((n, 2)), dt), rtol=1e-7)
+    return Dataset(inputs, exact + [2e-5, 2e-3] * rng.standard_normal((n, 2)), dt)
+
+
+@pytest.mark.parametrize("cogging", mostly_soak([0.1, 0.0]))
+def test_a_force_that_repeats_with_a_position_is_named_with_its_period(cogging):
+    record = drive_log(cogging)
+    estimator = GASSI(DRIVE, population=30, generations=10).fit(record)
+    uncertainty = estimator.uncertainty([record])
+    terms = [finding.term for finding in suspected(estimator, uncertainty, [record]).findings]
+    verdict = verdict_of(estimator, [record])
+    if not cogging:
+        assert verdict.parameters.trust == "good", verdict.reasons
+        return
+    sine = next(term for term in terms if term is not None and term.shape == "sine")
+    assert 2.0 * np.pi * sine.scale == pytest.approx(PITCH, rel=0.01)
+    assert np.cos(0.7 + sine.centre / sine.scale) > 0.9
+    assert verdict.parameters.trust != "good"
+    assert "that repeats with x (every 0.024), like cogging" in " ".join(verdict.reasons)
+
+
 CELL = ProcessModel(
     name="cell",
     states=(State("charge", "1", initial=1.0), State("lagging", "V")),

@@ -26,6 +26,7 @@ SHAPES = {
     "cube": lambda z: z**3,
     "abs": math.fabs,
     "parabola": lambda z: z**2,
+    "sine": math.sin,
     "stribeck": lambda z: math.copysign(math.exp(-z * z), z),
 }
 
