@@ -347,7 +347,7 @@ def test_terms_are_added_to_a_model_and_kept_in_its_result(folder):
     [
         ({"of": "speed"}, r"id.yaml:\d+:\d+: terms.0: .*no state or input 'speed'"),
         ({"scale": -1.0}, r"terms.0.scale"),
-        ({"shape": "sine"}, r"terms.0.shape"),
+        ({"shape": "wave"}, r"terms.0.shape"),
         ({"range": [3.0, 2.0]}, r"terms.0: .*low end at or above"),
     ],
 )
