@@ -190,7 +190,8 @@ class Round:
         """Where an identification with more logs begins; None where this one leaves things open."""
         result, intervals = self.result, self.intervals()
         poor = result["verdict"]["parameters"]["trust"] == "poor"
-        if poor or result.get("rivals") or any(i.width is None for i in intervals):
+        nowhere = any(i.low is None and i.high is None for i in intervals)
+        if poor or result.get("rivals") or nowhere:
             return None
         values = {name: float(entry["value"]) for name, entry in result["parameters"].items()}
         ends = {
