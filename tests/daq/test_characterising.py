@@ -7,6 +7,7 @@ import signal
 import subprocess
 
 import pytest
+import yaml
 
 from daq.characterise import characterise as use_case
 from daq.characterise.rounds import Request, Round, rounds_of
@@ -83,6 +84,28 @@ def test_what_was_done_is_not_done_again(finished, tmp_path):
     assert json.loads(done.stdout)["quantities"] == finished[1]["quantities"]
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "c").rglob("log.csv")} == logs
     assert (tmp_path / "c" / "report" / "report.html").exists()
+
+
+def test_a_later_round_begins_where_the_last_one_left_no_quantity_without_an_end(
+    finished, tmp_path
+):
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
+    first = rounds_of(tmp_path / "c")[0]
+    file = first.identification / "parameters.yaml"
+    for ends, goes_on in (
+        ([0.1, 0.2], True),
+        ([None, 0.2], True),
+        ([0.1, None], True),
+        (None, False),
+    ):
+        content = yaml.safe_load(file.read_text())
+        content["parameters"]["K_m"]["interval"] = ends
+        file.write_text(yaml.safe_dump(content))
+        earlier = first.as_earlier_fit
+        assert (earlier is not None) == goes_on
+        if earlier is not None:
+            assert ("K_m" in earlier.intervals) == (None not in ends)
+            assert earlier.values["K_m"] == content["parameters"]["K_m"]["value"]
 
 
 def test_each_run_has_noise_of_its_own(finished):
