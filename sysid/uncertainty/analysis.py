@@ -36,6 +36,8 @@ _ALIKE = 0.05  # rivals closer than this are one
 _SIDES = (-1.0, 1.0)
 _ROUNDS = 3  # of searches that go on from what others came to
 _FAR = 0.1  # of the way to an end, by which such a place is beyond it
+# Parameters of a combination whose ranges' corners are looked at.
+_MOST_CORNERS = 8
 _LEAST = 1e-12  # variance, and share of others', of what a covariance holds for known exactly
 
 
@@ -389,7 +391,7 @@ class _Analysis:
     def _widest(self, estimate: Estimate) -> float:
         """Deviation of which the farther end of an interval is one of 95 %, in parts of slopes.
 
-        Of a parameter that has no end there to that of its range; infinite of a combination.
+        Where there is no end, that of the range.
         """
         ends = estimate.low, estimate.high
         if estimate.combination is None:
@@ -401,8 +403,22 @@ class _Analysis:
                 for end, bound in zip(ends, bounds, strict=True)
             ]
             return max(abs(end - at) for end in there) / Z95
-        distances = [abs(end - estimate.value) for end in ends if end is not None]
-        return max(distances) / Z95 if len(distances) == len(ends) else float("inf")
+        low, high = self._in_ranges(estimate) if None in ends else (0.0, 0.0)
+        there = [low if estimate.low is None else estimate.low]
+        there += [high if estimate.high is None else estimate.high]
+        return max(abs(end - estimate.value) for end in there) / Z95
+
+    def _in_ranges(self, estimate: Estimate) -> tuple[float, float]:
+        """Least and most that a combination is at corners of its parameters' ranges."""
+        places = np.flatnonzero(self.gradients[estimate.name])
+        if len(places) > _MOST_CORNERS:
+            return -np.inf, np.inf
+        values = []
+        for upper in itertools.product((False, True), repeat=len(places)):
+            corner = self.chromosome.copy()
+            corner[places] = np.where(upper, self.space.upper[places], self.space.lower[places])
+            values.append(estimate.at(named_values(self.space, corner)))
+        return min(values), max(values)
 
     def _changes(self, point: FloatArray) -> FloatArray:
         """How far quantities are at search coordinates from the estimate, in parts of slopes."""

@@ -779,6 +779,23 @@ def test_a_weak_parameter_has_the_ends_that_its_slope_gives(seed):
                                for end in expected]  # fmt: skip
 
 
+@pytest.mark.parametrize("seed", [2, 3, 8])
+def test_a_weak_sum_is_passed_on_as_wide_as_its_one_end_and_the_range_say(seed):
+    """Its lower end is that of the ranges, where it stands."""
+    problem = Problem(
+        lambda p, u: columns(p["a"] * u[:, 0] + 1e-2 * (p["b"] + p["d"]) * u[:, 1]),
+        [unknown("a", 2.0), unknown("b", 0.1), unknown("d", 0.1)],
+        inputs=2,
+        sigma=0.1,
+        seed=seed,
+    )
+    result = problem.tell(Formulated("b + d", ("b", "d"), lambda b, d: b + d))
+    ((total,),) = (ambiguity.determined for ambiguity in result.ambiguities)
+    assert (total.value, total.low) == (pytest.approx(0.02), None)
+    passed_on = np.linalg.norm(result.factor[:, 1] + result.factor[:, 2])
+    assert Z * passed_on == pytest.approx((total.high or 0.0) - total.value, rel=1e-3)
+
+
 @pytest.mark.soak
 def test_ends_of_a_weak_parameter_hold_the_truth():
     held = []
