@@ -27,11 +27,12 @@ from sysid.experiments.information import Informant, without_starts
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
-_ITERATIONS = 30  # of a refit
+_ITERATIONS = 100  # of a refit
 _DAMPING = 1e-2  # with which one begins, in parts of the curvature
 _LIGHTEST, _HEAVIEST = 1e-6, 1e4
 _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)  # that are tried at once, as many as there are lanes
-_ENOUGH = 0.01  # share of what is left, by which an iteration is to lower it
+# What an iteration is to lower the rest by: a share of it, and not more than what decides nothing.
+_ENOUGH, _LITTLE = 0.01, 0.5
 _PATIENCE = 3  # iterations in a row that lower it by less
 _NOTHING = 0.01  # what is left of which nothing need be fitted
 
@@ -199,26 +200,35 @@ def refit(answers: Sequence[Answer], rival: Hypothesis, start: FloatArray) -> Fl
     space, small, damping = rival.space, 0, _DAMPING
     low, high = space.coded_lower, space.coded_lower + space.width
     at = np.clip(space.encode(start), low, high)
-    contrasts = [contrast(each, rival, space.decode(at)) for each in answers]
+    joint, contrasts = _joint(answers, rival, at)
     for _ in range(_ITERATIONS):
-        joint = np.sum([each.joint for each in contrasts], axis=0)
-        if not np.isfinite(joint).all() or joint[-1, -1] < _NOTHING:
+        left = float(joint[-1, -1])
+        if not np.isfinite(left) or left < _NOTHING or small == _PATIENCE:
             break
         weights = damping * _DAMPINGS
         offers = np.clip(at + _moves(joint, rival.ridge, weights, at <= low, at >= high), low, high)
         rest = _rest(contrasts, rival, offers)
         best = int(np.argmin(rest))
-        if rest[best] >= joint[-1, -1]:
-            damping = weights[-1]
+        moved = _joint(answers, rival, offers[best]) if rest[best] < left else None
+        # Where it has no tangents there is no going on: rather less far.
+        if moved is None or not np.isfinite(moved[0]).all():
+            damping = float(weights[-1])
             if damping > _HEAVIEST:
                 break
             continue
         at, damping = offers[best], float(max(weights[best], _LIGHTEST))
-        small = small + 1 if rest[best] > (1.0 - _ENOUGH) * joint[-1, -1] else 0
-        if small == _PATIENCE:
-            break
-        contrasts = [contrast(each, rival, space.decode(at)) for each in answers]
+        joint, contrasts = moved
+        small = small + 1 if left - rest[best] < min(_ENOUGH * left, _LITTLE) else 0
     return space.decode(at)
+
+
+def _joint(
+    answers: Sequence[Answer], rival: Hypothesis, at: FloatArray
+) -> tuple[FloatArray, list[Contrast]]:
+    """The M of all answers at coordinates (n_free,), and what it is the sum of."""
+    contrasts = [contrast(each, rival, rival.space.decode(at)) for each in answers]
+    total: FloatArray = np.sum([each.joint for each in contrasts], axis=0)
+    return total, contrasts
 
 
 def _rest(contrasts: Sequence[Contrast], rival: Hypothesis, coded: FloatArray) -> FloatArray:

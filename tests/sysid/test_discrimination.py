@@ -1,5 +1,7 @@
 """Experiments that tell structures apart, where the best rival is known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -90,6 +92,25 @@ def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
     assert end == pytest.approx([best], rel=1e-6)
     exact = np.sum((y - best * u) ** 2) / NOISE**2
     assert noncentrality([told], rival, end) == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_rival_is_fitted_to_noisy_logs_as_well_as_it_can_be():
+    """Along Rosenbrock's valley, of which noise leaves a hundredth part to gain."""
+    valley = spring(
+        "valley",
+        lambda u, p: (1.0 - u) * p[0] + u * 10.0 * (p[1] - p[0] * p[0]),
+        ("k", 1.0, -2.0, 2.0),
+        ("q", 1.0, -1.0, 3.0),
+    )
+    u, rng = np.arange(2000) % 2.0, np.random.default_rng(0)
+    rival = structure(valley)
+    exact = answer(rival, blank(valley, u[:, None], DT), 1, np.array([True]))
+    noise = 100.0 * NOISE * rng.standard_normal(exact.outputs.shape)
+    log = replace(exact, outputs=exact.outputs + noise, weights=exact.weights / 1e4)
+    end = refit([log], rival, np.array([-1.2, 1.0]))
+    halves = [log.outputs[u == side, 0] for side in (0.0, 1.0)]
+    least = sum(float(np.sum((y - y.mean()) ** 2)) for y in halves) / (100.0 * NOISE) ** 2
+    assert contrast(log, rival, end).joint[-1, -1] == pytest.approx(least, abs=1.0)
 
 
 @pytest.mark.soak
