@@ -36,8 +36,6 @@ _ALIKE = 0.05  # rivals closer than this are one
 _SIDES = (-1.0, 1.0)
 _ROUNDS = 3  # of searches that go on from what others came to
 _FAR = 0.1  # of the way to an end, by which such a place is beyond it
-# Parameters of a combination whose ranges' corners are looked at.
-_MOST_CORNERS = 8
 _LEAST = 1e-12  # variance, and share of others', of what a covariance holds for known exactly
 
 
@@ -403,22 +401,9 @@ class _Analysis:
                 for end, bound in zip(ends, bounds, strict=True)
             ]
             return max(abs(end - at) for end in there) / Z95
-        low, high = self._in_ranges(estimate) if None in ends else (0.0, 0.0)
-        there = [low if estimate.low is None else estimate.low]
-        there += [high if estimate.high is None else estimate.high]
+        ranges = Expression(self.space, self.combined[estimate.name], log=False).ends
+        there = [bound if end is None else end for end, bound in zip(ends, ranges, strict=True)]
         return max(abs(end - estimate.value) for end in there) / Z95
-
-    def _in_ranges(self, estimate: Estimate) -> tuple[float, float]:
-        """Least and most that a combination is at corners of its parameters' ranges."""
-        places = np.flatnonzero(self.gradients[estimate.name])
-        if len(places) > _MOST_CORNERS:
-            return -np.inf, np.inf
-        values = []
-        for upper in itertools.product((False, True), repeat=len(places)):
-            corner = self.chromosome.copy()
-            corner[places] = np.where(upper, self.space.upper[places], self.space.lower[places])
-            values.append(estimate.at(named_values(self.space, corner)))
-        return min(values), max(values)
 
     def _changes(self, point: FloatArray) -> FloatArray:
         """How far quantities are at search coordinates from the estimate, in parts of slopes."""
