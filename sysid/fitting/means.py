@@ -93,7 +93,7 @@ def scatter(record: Dataset, run: Run | None = None) -> FloatArray:
     variances = np.zeros(record.outputs.shape)
     if not (record.windows.size and record.jitter.any()):
         return variances
-    means, slopes = _of_run(record, run) if run is not None else (variances, variances)
+    of_run = None if run is None else _of_run(record, run)
     for j in np.flatnonzero(record.windows.any(axis=(0, 2))).tolist():
         rows, firsts, spans = _distinct(record, j)
         if len(firsts) < 2:
@@ -104,10 +104,12 @@ def scatter(record: Dataset, run: Run | None = None) -> FloatArray:
         excess = 1.0 + (in_time[1:] + in_time[:-1]) / apart**2
         distinct, measured = rows[firsts], record.outputs[rows[firsts], j]
         plain = np.diff(measured) / apart
-        beside = np.diff(measured - means[distinct, j]) / apart
-        with_run = _squares(slopes[distinct, j], beside, excess)
-        straighter = _bend(beside) < _bend(plain)
-        squares = np.where(straighter, with_run, _squares(np.zeros(len(distinct)), plain, excess))
+        squares = _squares(np.zeros(len(distinct)), plain, excess)
+        if of_run is not None:
+            means, slopes = (table[distinct, j] for table in of_run)
+            beside = np.diff(measured - means) / apart
+            straighter = _bend(beside) < _bend(plain)
+            squares = np.where(straighter, _squares(slopes, beside, excess), squares)
         squares = np.maximum(squares, _AROUND * _around(squares, _NEAR))
         place = np.searchsorted(firsts, np.arange(len(rows)), side="right") - 1
         variances[rows, j] = squares[place] * jitter**2

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from sysid.arrays import FloatArray
 from sysid.judging.disturbed import DisturbedRun
-from sysid.judging.suspects import Suspect, added, physical_equations
+from sysid.judging.suspects import Suspect, of_terms, physical_equations
 from sysid.problem.terms import AddedTerm
 
 _MOST_CYCLES = 40  # within the range of a position, or in a turn
@@ -43,7 +43,7 @@ def cycle_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
                 yield suspect
             else:
                 periods = [extent / (cycles + part) for part in _CLOSER.tolist()]
-                yield suspect.with_closer(partial(_sized, runs, position, speed, periods))
+                yield replace(suspect, closer=partial(_sized, runs, position, speed, periods))
 
 
 def _cycles(extent: float, turn: float) -> list[float]:
@@ -62,19 +62,12 @@ def _sized(
 def _cycle(runs: Sequence[DisturbedRun], position: int, speed: int, period: float) -> Suspect:
     """A sine and a cosine of this period in the position's unit."""
     model, scale = runs[0].model, period / (2.0 * math.pi)
-    of, equation = model.states[position], model.states[speed]
+    equation, of = model.states[speed].name, model.states[position].name
     terms = tuple(
-        AddedTerm(equation.name, of.name, "sine", scale, -1.0, 1.0, centre)
+        AddedTerm(equation, of, "sine", scale, -1.0, 1.0, centre)
         for centre in (0.0, -0.25 * period)
     )
-
-    def along(centre: float, run: DisturbedRun) -> FloatArray:
-        wave: FloatArray = np.sin((run.states[:, position] - centre) / scale)
-        return wave
-
-    columns = [added(runs, speed, partial(along, term.centre)) for term in terms]
-    changes = np.stack(columns, axis=2)
-    return Suspect("function", equation.name, f"{equation.unit}/s", changes, terms)
+    return of_terms(runs, speed, position, terms)
 
 
 def _positions(runs: Sequence[DisturbedRun]) -> Iterator[tuple[int, int]]:

@@ -77,10 +77,6 @@ class Suspect:
     of_input: bool = False
     closer: Callable[[], "Sequence[Suspect]"] | None = None
 
-    def with_closer(self, closer: Callable[[], "Sequence[Suspect]"]) -> "Suspect":
-        """The same, of which such are beside it."""
-        return replace(self, closer=closer)
-
     @property
     def one_sided(self) -> bool:
         """Whether only amplitudes above zero make sense: friction never drives."""
@@ -389,16 +385,27 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     model = runs[0].model
     signals: list[State | Input] = [*model.states, *model.inputs]
     for i in physical_equations(runs[0]):
-        state = model.states[i]
         for j, signal in enumerate(signals):
             together = np.concatenate([_signal(run, j) for run in runs])
             held = isinstance(signal, Input) and signal.hold == "zoh"
             if len(np.unique(together)) < _LEVELS or (_jumps(together) and not held):
                 continue
-            for terms in _terms(state.name, signal.name, together):
-                columns = [added(runs, i, partial(_term_along, term, j, held)) for term in terms]
-                unit = f"{state.unit}/s"
-                yield Suspect("function", state.name, unit, np.stack(columns, axis=2), terms)
+            for terms in _terms(model.states[i].name, signal.name, together):
+                yield of_terms(runs, i, j, terms, held=held)
+
+
+def of_terms(
+    runs: Sequence[DisturbedRun],
+    i: int,
+    j: int,
+    terms: tuple[AddedTerm, ...],
+    *,
+    held: bool = False,
+) -> Suspect:
+    """Functions of signal j, counted through states and inputs, in equation i together."""
+    state = runs[0].model.states[i]
+    columns = [_added(runs, i, partial(_term_along, term, j, held)) for term in terms]
+    return Suspect("function", state.name, f"{state.unit}/s", np.stack(columns, axis=2), terms)
 
 
 def _term_along(term: AddedTerm, j: int, held: bool, run: DisturbedRun) -> FloatArray:
@@ -467,7 +474,7 @@ def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     ]
     for i in physical_equations(runs[0]):
         state = runs[0].model.states[i]
-        columns = [added(runs, i, wave) for wave in waves]
+        columns = [_added(runs, i, wave) for wave in waves]
         yield Suspect("disturbance", state.name, f"{state.unit}/s", np.stack(columns, axis=2))
 
 
@@ -503,7 +510,7 @@ def _signal(run: DisturbedRun, j: int) -> FloatArray:
     return run.states[:, j] if j < n else run.record.inputs[:, j - n]
 
 
-def added(
+def _added(
     runs: Sequence[DisturbedRun], i: int, signal: Callable[[DisturbedRun], FloatArray]
 ) -> FloatArray:
     """Changes by a signal (n_samples,) of each run that is added to equation i."""
