@@ -52,6 +52,11 @@ _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
 # Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
 # output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
+_STRUCTURE_UNTESTED = (
+    "What the model may lack was not tested: if something is missing, parameters may be off "
+    "by more than their intervals."
+)
+_PARAMETER_PRAISE = "Nothing was found missing that would move a parameter beyond its interval."
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
 
@@ -201,21 +206,15 @@ def judge(
         if uncertainty is not None:
             light += _filter_errors(model, uncertainty)
             light += _bent_filter(model, uncertainty)
-    if uncertainty is None:
-        light.append("The parameters have no intervals, so how surely each is known is not known.")
-    else:
-        light += _parameters_on_bounds(uncertainty)
-        light += _corrected(model, uncertainty)
+    light += _of_intervals(model, uncertainty, findings)
     grave = list(broken)
     if predicted.trust == "poor" and not broken:
         grave.append("Of a model that predicts so poorly the parameters are not the plant's.")
-    parameters = Statement.of(grave, light, _parameter_praise(findings))
+    parameters = Statement.of(grave, light, _PARAMETER_PRAISE)
     slight = "; ".join(description(f) for f in missing if f not in counting)
     moving = f"Found, but moving no parameter by {MOVED:g} standard deviations: {slight}."
     notes = [moving] if slight else []
-    return Verdict(
-        predicted, parameters, (*notes, *_untested(model, judged, findings, uncertainty))
-    )
+    return Verdict(predicted, parameters, (*notes, *_untested(model, judged, uncertainty)))
 
 
 def _prediction(
@@ -251,6 +250,19 @@ def _poor_fits(model: ProcessModel, training: Sequence[RecordResult]) -> Iterato
     for name, fit, at_floor in zip(model.output_names, fits, floor, strict=True):
         if fit < FITTED and not at_floor:
             yield f"{name} is explained poorly even on the training data (fit {fit:.0f} %)."
+
+
+def _of_intervals(
+    model: ProcessModel, uncertainty: Uncertainty | None, findings: Sequence[Finding] | None
+) -> Iterator[str]:
+    """Reasons: no intervals, or such as ends, corrections or what was not tested may deceive."""
+    if uncertainty is None:
+        yield "The parameters have no intervals, so how surely each is known is not known."
+        return
+    yield from _parameters_on_bounds(uncertainty)
+    yield from _corrected(model, uncertainty)
+    if findings is None:
+        yield _STRUCTURE_UNTESTED
 
 
 def _moved_together(findings: Sequence[Finding]) -> float:
@@ -558,7 +570,6 @@ def _change(old: float, new: float, unit: str) -> str:
 def _untested(
     model: ProcessModel,
     results: Sequence[RecordResult],
-    findings: Sequence[Finding] | None,
     uncertainty: Uncertainty | None,
 ) -> Iterator[str]:
     """What could not be tested, and for want of what."""
@@ -571,15 +582,6 @@ def _untested(
             f"The noise of {', '.join(names)} is neither calibrated nor given: whether more could "
             "be explained is not tested."
         )
-    if findings is None:
-        yield "What the model may lack was not tested."
-
-
-def _parameter_praise(findings: Sequence[Finding] | None) -> str:
-    """The reason for parameters that hold."""
-    if findings is None:
-        return "Nothing speaks against the parameters' intervals."
-    return "Nothing was found missing that would move a parameter beyond its interval."
 
 
 def _praise(model: ProcessModel, validation: Sequence[RecordResult]) -> str:

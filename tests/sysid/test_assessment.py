@@ -61,7 +61,8 @@ def told(*whys):
 def verdict(training=None, validation=None, uncertainty=None, feasible=True):
     training = [result(1)] if training is None else training
     validation = [result(2)] if validation is None else validation
-    return judge(MODEL, training, validation, uncertainty or told("", ""), feasible)
+    sure = uncertainty or told("", "")
+    return judge(MODEL, training, validation, sure, feasible, findings=())
 
 
 def test_examine_measures_each_record_with_its_own_scale_and_inputs():
@@ -79,13 +80,19 @@ def test_nothing_wrong_is_good():
     found = verdict()
     assert found.trust == "good"
     (reason,) = found.predicted.reasons
-    assert found.parameters.reasons == ("Nothing speaks against the parameters' intervals.",)
+    assert "Nothing was found missing" in found.parameters.reasons[0]
     fit = np.mean(result(2).metrics.fit)
     assert f"mean fit {fit:.1f} %" in reason
 
 
 def test_what_is_tied_or_hardly_felt_is_no_reason_to_doubt_the_rest():
-    assert judge(MODEL, [result(1)], [result(2)], told("tied", "vague")).trust == "good"
+    assert verdict(uncertainty=told("tied", "vague")).trust == "good"
+
+
+def test_parameters_of_a_structure_that_was_not_tested_are_not_good():
+    found = judge(MODEL, [result(1)], [result(2)], told("", ""), findings=None)
+    assert (found.predicted.trust, found.parameters.trust) == ("good", "limited")
+    assert "was not tested" in found.parameters.reasons[0]
 
 
 def test_without_intervals_predictions_may_be_good_but_no_parameter_is_known():
@@ -272,7 +279,7 @@ def test_faults_of_the_data_count_where_they_matter():
             0.1,
             **kind,
         )
-        return judge(MODEL, [result(1)], [result(2)], told(""), faults=[fault])
+        return judge(MODEL, [result(1)], [result(2)], told(""), findings=(), faults=[fault])
 
     assert with_fault("note", moves_parameters=True).trust == "good"
     moved, void = with_fault(moves_parameters=True), with_fault(voids_validation=True)
