@@ -180,7 +180,7 @@ def _orders(orders: Mapping[str, Any], outputs: Sequence[str]) -> str:
 
 def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
     """What a reader may do with the result, or to better it: the most useful first."""
-    verdict, steps = document["verdict"], _cures(rows)
+    verdict, steps, better = document["verdict"], _cures(rows), document.get("next")
     if verdict["predictions"]["trust"] != "poor":
         again = document["reproduction"]
         use = (
@@ -194,8 +194,14 @@ def _steps(document: Mapping[str, Any], rows: Rows) -> list[Step]:
         steps.insert(0, Step(use, command=command + trust_option(document["model"])))
     elif not steps:
         steps.append(Step("See in the residuals below when and where the model errs."))
-    if better := document.get("next"):
+    if better:
         steps.insert(0, Step(better["purpose"], command=better["command"]))
+    elif rows.weak:
+        text = (
+            " matter: these data hardly feel them. `rig design`, or `sysid.design` of a model "
+            "without a rig, finds such runs."
+        )
+        steps.append(Step("Record an experiment that makes ", [r.name for r in rows.weak], text))
     unsure = verdict["predictions"]["trust"] != "good"
     if rows.logs["validation"] and unsure and rows.weak:
         steps.append(
@@ -227,7 +233,5 @@ def _cures(rows: Rows) -> list[Step]:
              "this is not needed."),
         Step("Give the start of ", list(dict.fromkeys(n.partition("(")[0] for n in starts)),
              " under `initial` in a file for `--config`."),
-        Step("Record an experiment that makes ", [row.name for row in rows.weak], " matter, larger "
-             "or slower or faster than this one: these data hardly feel them."),
     )  # fmt: skip
     return [step for step in cures if step.names]
