@@ -450,6 +450,8 @@ def _searched(identification: Identification, place: int) -> dict[str, Any]:
     ends = parameter.lower, parameter.upper
     end = min(ends, key=lambda end: abs(end - estimate.value))
     entry |= {"on_bound": estimate.on_bound, "pushed": estimate.pushed}
+    if estimate.harmless:
+        entry["harmless"] = True
     if estimate.on_bound and end in (parameter.minimum, parameter.maximum):
         entry["at_limit"] = True
     return {**entry, **_interval(estimate)}

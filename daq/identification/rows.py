@@ -130,13 +130,15 @@ class ParameterRow(QuantityRow):
     """A parameter of the model: searched in a range, tied to others, or fixed.
 
     source: where its range or value comes from. on_bound: whether it stands on an end of its
-    range; pushed: whether the data want it beyond; at_limit: whether that end is a physical limit.
+    range; pushed: whether the data want it beyond; harmless: whether that end decides nothing;
+    at_limit: whether it is a physical limit.
     """
 
     range: tuple[float, float] | None = None
     logarithmic: bool = False
     on_bound: bool = False
     pushed: bool = False
+    harmless: bool = False
     at_limit: bool = False
     tied: str | None = None
     source: str = "model"
@@ -169,7 +171,8 @@ class ParameterRow(QuantityRow):
     def label(self) -> str:
         """Why it has no interval, and that it stands on an end of its range."""
         end = "at its limit" if self.at_limit else "at its end"
-        return ", ".join(filter(None, (self.undetermined_label, end if self.on_bound else "")))
+        decided = end if self.on_bound and not self.harmless else ""
+        return ", ".join(filter(None, (self.undetermined_label, decided)))
 
 
 @dataclass(frozen=True)
@@ -448,6 +451,7 @@ def _parameter(name: str, entry: Mapping[str, Any]) -> ParameterRow:
         logarithmic=entry.get("scale") == "log",
         on_bound=bool(entry.get("on_bound")),
         pushed=bool(entry.get("pushed")),
+        harmless=bool(entry.get("harmless")),
         at_limit=bool(entry.get("at_limit")),
         tied=entry.get("tied"),
         source=entry.get("source", "model"),

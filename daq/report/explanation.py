@@ -222,7 +222,8 @@ def _cures(rows: Rows) -> list[Step]:
     measure = dict.fromkeys(name for a in rows.ambiguities_of("tied") for name in a.measure)
     starts = [name for name in measure if "(0)" in name]
     rival = [a.measure[0] for a in rows.ambiguities_of("rival")]
-    held = [row.name for row in rows.parameters if row.on_bound and not row.at_limit]
+    at_ends = [row for row in rows.parameters if row.on_bound and not row.at_limit]
+    held = [row.name for row in at_ends if not row.harmless]
     cures = (
         Step("Give ", held, " more room under `ranges`, or a value under `fixed`: now an end of "
              "the range decides."),

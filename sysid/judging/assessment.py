@@ -36,8 +36,6 @@ _HARDLY_WORSE, _FAR_WORSE = 1.3, 2.0
 # Of an output's deviation, below which an error, or what is left of an input, is nothing to mend;
 # and below which it says nothing of parameters either.
 _SMALL, _TRACE = 0.01, 5e-3
-_INDEPENDENT = 0.75  # share of lags inside a 95 % band below which something is left
-_BANDS = 3.0  # mean of the first correlations in parts of their bands, above which it is as well
 FITTED = 50.0  # fit [%] below which a model explains little
 # Correlation with an input below which what is left is found in long records, but is nothing to
 # mend: one per cent of the residuals' variance.
@@ -360,19 +358,21 @@ def _failing_starts(results: Sequence[RecordResult]) -> Iterator[str]:
 
 
 def _follows(results: Sequence[RecordResult]) -> BoolArray:
-    """Where residuals follow an input by share or by size, noticeably, (n_outputs, n_inputs)."""
-    shares, sizes = _input_correlations(results)
-    bands = mean_known([result.residuals.first_bands for result in results], 0)
-    with np.errstate(invalid="ignore"):
-        follows: BoolArray = ((shares < _INDEPENDENT) | (bands > _BANDS)) & (sizes > _NOTICEABLE)
-    return follows & np.isfinite(shares)
+    """Where residuals follow an input by more than chance, noticeably, (n_outputs, n_inputs)."""
+    chance, sizes = _input_correlations(results)
+    follows: BoolArray = (chance < _BY_CHANCE) & (sizes > _NOTICEABLE)
+    return follows
 
 
 def _input_correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, FloatArray]:
-    """Share of correlations inside their band and the largest, (n_outputs, n_inputs), means."""
-    shares = mean_known([result.residuals.independent for result in results], 0)
+    """Chance of the residuals' correlations, all tests together, and their largest in the mean.
+
+    (n_outputs, n_inputs) each.
+    """
+    tests = sum(r.residuals.tested.sum() * len(r.residuals.chance) for r in results)
+    chance = tests * np.min([result.residuals.chance for result in results], axis=0)
     sizes = np.mean([np.abs(result.residuals.cross).max(axis=0) for result in results], axis=0)
-    return shares, sizes
+    return chance, sizes
 
 
 def _input_parts(results: Sequence[RecordResult]) -> FloatArray:
@@ -511,8 +511,8 @@ def _bent_filter(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]
 
 
 def _parameters_on_bounds(uncertainty: Uncertainty) -> Iterator[str]:
-    """Reason: parameters that stand on an end of their range."""
-    ends = [p.name for p in uncertainty.parameters if p.on_bound]
+    """Reason: parameters that stand on an end of their range, where it decides anything."""
+    ends = [p.name for p in uncertainty.parameters if p.on_bound and not p.harmless]
     starts = [name for name in ends if "(0)" in name]
     names = [name for name in ends if name not in starts]
     if names:
@@ -589,8 +589,8 @@ def _praise(model: ProcessModel, validation: Sequence[RecordResult]) -> str:
     if not validation:
         return ""
     fit = float(mean_known([result.metrics.fit for result in validation]))
-    shares, sizes = _input_correlations(validation)
-    traces = sizes[shares < _INDEPENDENT]
+    chance, sizes = _input_correlations(validation)
+    traces = sizes[chance < _BY_CHANCE]
     reason = (
         f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} %)"
     )
@@ -601,6 +601,6 @@ def _praise(model: ProcessModel, validation: Sequence[RecordResult]) -> str:
     if len(traces):
         reason += ", and what the residuals keep of the inputs is no more than a trace of the "
         reason += f"outputs (correlations of at most {traces.max():.2f})"
-    elif np.isfinite(shares).any():
+    elif any(result.residuals.tested.any() for result in validation):
         reason += ", and nothing of the inputs is left in the residuals"
     return f"{reason}."

@@ -85,7 +85,7 @@ def examined(
         estimator.chromosome_,
         record,
         run.start,
-        uncertainty.covariance,
+        uncertainty.by_slopes,
     )
     return run.outputs, examine(record, run.outputs, expected, starts)
 

@@ -13,11 +13,12 @@ from scipy.special import chdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
+from sysid.fitting.means import Run, each_mean_once, scatter
 from sysid.judging.evidence import independent_samples
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
-_DRAWS = 24  # realisations of the inputs' noise: they give a variance to within 30 %
+_DRAWS = 40  # realisations of the inputs' noise: they give a variance to within 22 %
 _STEP = 1e-5  # of a search coordinate, for slopes
 _FINER = 1e-2  # part of the accuracy at which the error of a simulation shows
 
@@ -34,13 +35,24 @@ class ExpectedErrors:
     """Errors that a right model makes on a record.
 
     noise: (n_outputs,), variance by the sensors' noise, of inputs and outputs; NaN where that of
-    the output is not known. systematic: (n_samples, n_outputs, k), errors that go with the inputs,
-    each by one standard deviation of what makes it: directions of the parameters, the sample that
-    a state starts at, the simulation.
+    the output is not known. chance: (n_outputs,), variance of that variance from one log to the
+    next, by the noise of inputs, which a plant passes on slowly or at times. systematic:
+    (n_samples, n_outputs, k), errors that go with the inputs, each by one standard deviation of
+    what makes it: directions of the parameters, the sample that a state starts at, the simulation.
     """
 
     noise: FloatArray
+    chance: FloatArray
     systematic: FloatArray
+
+    @property
+    def freedom(self) -> FloatArray:
+        """Degrees of freedom of the mean square, (n_outputs,), were sensors' noise white."""
+        each = np.mean(self.systematic**2, axis=0)
+        chance = self.chance + 2.0 * np.sum(each**2, axis=1)
+        with np.errstate(divide="ignore"):
+            freedom: FloatArray = 2.0 * self.variance**2 / chance
+        return freedom
 
     @property
     def variance(self) -> FloatArray:
@@ -100,10 +112,25 @@ def expected_errors(
         run = simulator.trajectories(vector[None], record, n_steps, moved[None])[0]
         change = np.where(np.isfinite(run), run - undisturbed, 0.0)
         systematic.append(change[..., None])
-    variance = np.where(record.output_noise > 0.0, record.output_noise**2, np.nan)
+    jitter = _by_jitter(record, lambda given: runs(vector[None], given)[0])
+    variance = record.output_noise**2 + jitter
+    variance = np.where(variance > 0.0, variance, np.nan)
+    chance = np.zeros(len(variance))
     if np.any(record.input_noise):
-        variance = variance + _by_input_noise(runs, vector, record, undisturbed)
-    return ExpectedErrors(variance, np.concatenate(systematic, axis=2))
+        squares = _by_input_noise(runs, vector, record, undisturbed)
+        variance, chance = variance + squares.mean(axis=0), squares.var(axis=0, ddof=1)
+    return ExpectedErrors(variance, chance, np.concatenate(systematic, axis=2))
+
+
+def _by_jitter(record: Dataset, run: Run) -> FloatArray:
+    """Variance of each output whose windows' ends are known so well only, (n_outputs,)."""
+    if not record.jitter.any():
+        return np.zeros(record.outputs.shape[1])
+    once = each_mean_once(record)
+    single = once.jitter > 0.0
+    counts = np.maximum(single.sum(axis=0), 1)
+    variance: FloatArray = np.sum(np.where(single, scatter(once, run), 0.0), axis=0) / counts
+    return variance
 
 
 def _noisy_starts(simulator: BatchSimulator, record: Dataset, run: FloatArray) -> dict[int, float]:
@@ -137,13 +164,13 @@ def _by_parameters(
 def _by_input_noise(
     runs: Runs, vector: FloatArray, record: Dataset, undisturbed: FloatArray
 ) -> FloatArray:
-    """Variance of each output by noise of the inputs, (n_outputs,)."""
-    rng, total = np.random.default_rng(0), np.zeros(undisturbed.shape[1])
-    for _ in range(_DRAWS):
+    """Mean square of each output by noise of the inputs, of each draw, (_DRAWS, n_outputs)."""
+    rng, squares = np.random.default_rng(0), np.zeros((_DRAWS, undisturbed.shape[1]))
+    for draw in squares:
         noise = rng.standard_normal(record.inputs.shape) * record.input_noise
         disturbed = runs(vector[None], replace(record, inputs=record.inputs + noise))[0]
-        total += np.mean((disturbed - undisturbed) ** 2, axis=0)
-    return total / _DRAWS
+        draw[:] = np.mean((disturbed - undisturbed) ** 2, axis=0)
+    return squares
 
 
 def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
@@ -151,7 +178,8 @@ def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
 
     >>> rng = np.random.default_rng(0)
     >>> noise = rng.standard_normal((1000, 2)) * [1.0, 3.0]
-    >>> test = floor_test(noise, ExpectedErrors(np.ones(2), np.zeros((1000, 2, 0))))
+    >>> expected = ExpectedErrors(np.ones(2), np.zeros(2), np.zeros((1000, 2, 0)))
+    >>> test = floor_test(noise, expected)
     >>> test.ratio.round().tolist(), (test.p_value < 0.01).tolist()
     ([1.0, 3.0], [False, True])
     """
@@ -162,6 +190,6 @@ def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
         if len(measured) < 2:
             continue
         square = float(np.mean(measured**2)) / float(variance[j])
-        freedom = independent_samples([measured])
+        freedom = min(independent_samples([measured]), float(expected.freedom[j]))
         ratio[j], p_value[j] = np.sqrt(square), chdtrc(freedom, square * freedom)
     return FloorTest(ratio, p_value)

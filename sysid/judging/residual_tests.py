@@ -7,11 +7,12 @@ dynamics left in them?), each with 95 % bands (Ljung, "System Identification", s
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal.windows import parzen
+from scipy.special import chdtrc
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.uncertainty.estimate import Z95
 
-_FIRST = 5  # lags
 _LEAST_VARIANCE = 0.05  # of a correlation, in parts of 1/n: estimated ones can turn out negative
 
 
@@ -22,9 +23,10 @@ class ResidualTest:
     lags: (n_lags,), samples, from 0. auto: (n_lags, n_outputs), autocorrelation, 1 at lag 0;
     auto_band: (n_outputs,), half width of its 95 % band. cross: (n_lags, n_outputs, n_inputs),
     correlation of the residual with the input so many samples before, in parts of the product of
-    their deviations; cross_band: (n_outputs, n_inputs). tested: (n_inputs,), inputs that say
-    something: they change, and are not themselves measured with noise, which stands in the
-    residuals as well.
+    their deviations; cross_band: (n_outputs, n_inputs); chance: likewise, probability of
+    correlations so large at all lags together, were nothing left; 1 where that is not tested.
+    tested: (n_inputs,), inputs that say something: they change, and are not themselves measured
+    with noise, which stands in the residuals as well.
     """
 
     lags: IntArray
@@ -32,6 +34,7 @@ class ResidualTest:
     auto_band: FloatArray
     cross: FloatArray
     cross_band: FloatArray
+    chance: FloatArray
     tested: BoolArray
 
     @property
@@ -39,12 +42,6 @@ class ResidualTest:
         """Share of the lags above 0 inside the band, (n_outputs,); 0.95 is expected."""
         share: FloatArray = np.mean(np.abs(self.auto[1:]) <= self.auto_band, axis=0)
         return share
-
-    @property
-    def first_bands(self) -> FloatArray:
-        """|mean| of the first correlations with an input, in parts of its band, (q, m)."""
-        first = np.abs(np.mean(self.cross[:_FIRST], axis=0)) / self.cross_band
-        return np.where(self.tested, first, np.nan)
 
     @property
     def independent(self) -> FloatArray:
@@ -71,22 +68,61 @@ def residual_test(
     e, u = _standard(residual), _standard(inputs)
     counted = np.maximum(seen.sum(axis=0), 1)
     auto = np.stack([np.diagonal(_products(e, e, k)) for k in range(n_lags)]) / counted
-    driving = np.stack([np.diagonal(_products(u, u, k)) for k in range(n_lags)]) / len(u)
     cross = np.stack([_products(e, u, k) for k in range(n_lags)]) / counted[:, None]
     # Both being coloured widens the band: sum over k of R_e(k) R_u(k) / n is the variance.
-    widening = 1.0 + 2.0 * np.einsum("ko,ki->oi", auto[1:], driving[1:])
-    variance = np.maximum(widening, _LEAST_VARIANCE) / counted[:, None]
+    covariance = _coloured(e, u, n_lags) / counted[:, None]
+    variance = np.maximum(covariance[0], _LEAST_VARIANCE / counted[:, None])
     if systematic is not None:
-        variance = variance + _systematic_variance(systematic, residual, u, n_lags)
+        widening = _systematic_variance(systematic, residual, u, n_lags)
+        covariance, variance = covariance + widening, variance + widening
     noisy = np.zeros(inputs.shape[1]) if input_noise is None else np.asarray(input_noise)
+    tested = (noisy == 0.0) & np.any(u != 0.0, axis=0)
     return ResidualTest(
         lags=np.arange(n_lags),
         auto=auto,
         auto_band=Z95 / np.sqrt(counted),
         cross=cross,
         cross_band=Z95 * np.sqrt(variance),
-        tested=(noisy == 0.0) & np.any(u != 0.0, axis=0),
+        chance=np.where(tested, _chance(cross, variance, covariance), 1.0),
+        tested=tested,
     )
+
+
+def _coloured(e: FloatArray, u: FloatArray, n_lags: int) -> FloatArray:
+    """Covariances of correlations that many lags apart, (n_lags, n_outputs, n_inputs), times n.
+
+    Sums over all j of R_e(j) R_u(j + lag), by Parzen's window as far as they can be told: of slow
+    residuals and inputs that change seldom, correlations are wide, and all lags tell the same.
+    """
+    size, farthest = 2 * len(e), 2 * n_lags
+    window = np.zeros(size)
+    window[:farthest] = parzen(2 * farthest - 1)[farthest - 1 :]
+    window[-farthest + 1 :] = window[farthest - 1 : 0 : -1]
+    spectra_e, spectra_u = (
+        np.abs(np.fft.rfft(x, size, axis=0)) ** 2 / np.maximum(np.sum(x**2, axis=0), 1.0)
+        for x in (e, u)
+    )
+    smooth = np.fft.rfft(window[:, None] * np.fft.irfft(spectra_e, axis=0), axis=0).real
+    covariances = np.zeros((n_lags, e.shape[1], u.shape[1]))
+    for j, i in np.ndindex(covariances.shape[1:]):
+        covariances[:, j, i] = np.fft.irfft(smooth[:, j] * spectra_u[:, i])[:n_lags]
+    return covariances
+
+
+def _chance(cross: FloatArray, variance: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Probability of correlations, (n_lags, n_outputs, n_inputs), so large in the mean square.
+
+    variance: (n_outputs, n_inputs); covariance: as cross, of correlations that many lags apart.
+    Squares of what is correlated sum to a chi-square of fewer degrees of freedom.
+    """
+    n_lags = len(cross)
+    pairs = 2.0 * np.arange(n_lags, 0, -1)
+    pairs[0] = n_lags
+    correlation = covariance / variance
+    correlation[0] = 1.0  # of the least variance, too
+    freedom = n_lags**2 / np.tensordot(pairs, correlation**2, 1)
+    chance: FloatArray = chdtrc(freedom, np.mean(cross**2, axis=0) / variance * freedom)
+    return chance
 
 
 def _systematic_variance(

@@ -21,6 +21,7 @@ from sysid.problem.given import covariance_factor
 from sysid.problem.space import ON_BOUND
 from sysid.uncertainty.colour import successive_correlation
 from sysid.uncertainty.covariance import covariance, larger
+from sysid.uncertainty.ends import RangeEnds
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.profile import Fit, Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
@@ -69,13 +70,15 @@ class Uncertainty:
 
     parameters: an estimate for each free parameter (and estimated initial state). covariance:
     (n_free, n_free) of the search coordinates (logarithms where searched so, else the values),
-    zero of those without an interval. singular_values: of the sensitivity, its columns of length
-    one, falling. rank: how many directions the data determine. rivals: other minima that the data
-    do not tell from this one. joint: share of repetitions in which all intervals hold at once;
-    simultaneous: factor by which to widen them for that to be 95 %. disagreement: variance of the
-    estimates from single logs (or parts of the only one) in parts of what their noise makes, 1
-    where that is chance. factor: (n, n_free), independent changes of the parameters, one standard
-    deviation each, and a unit of every tie: what a later stage is ``Given``. succession:
+    zero of those without an interval. by_slopes: likewise of all of them, up to the ties, by the
+    slopes at the estimate: by how much simulated outputs vary. singular_values: of the sensitivity,
+    its columns of length one, falling. rank: how many directions the data determine. rivals: other
+    minima that the data do not tell from this one. joint: share of repetitions in which all
+    intervals hold at once; simultaneous: factor by which to widen them for that to be 95 %.
+    disagreement: variance of the estimates from single logs (or parts of the only one) in parts of
+    what their noise makes, 1 where that is chance. factor: (n, n_free), independent changes of the
+    parameters, one standard deviation each, and a unit of every tie: what a later stage is
+    ``Given``. succession:
     (n_outputs,), correlation of each innovation with the one before where a filter's were
     minimised, which are white at the right parameters of the right model; empty elsewhere. bent:
     likewise, share of the innovations for which its equations are no straight lines within noise.
@@ -93,6 +96,7 @@ class Uncertainty:
     factor: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     succession: FloatArray = field(default_factory=lambda: np.zeros(0))
     bent: FloatArray = field(default_factory=lambda: np.zeros(0))
+    by_slopes: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __repr__(self) -> str:
         single = sum(not estimate.why for estimate in self.parameters)
@@ -140,6 +144,7 @@ class Uncertainty:
                 for rival in self.rivals
             ),
             factor=self.factor[:, places] if self.factor.size else self.factor,
+            by_slopes=self.by_slopes[np.ix_(places, places)],
         )
 
     def determined(self) -> tuple[Estimate, ...]:
@@ -185,9 +190,15 @@ def uncertainty(
     tied = list(analysis.ambiguities())
     combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
     settled = analysis.settled([*drafts, *combined])
+    harmless = analysis.harmless_ends(settled)
     whole = (_with_bottoms(estimate, bottoms) for estimate in settled)
     estimates = iter(map(judged, whole))
-    parameters = list(itertools.islice(estimates, len(drafts)))
+    parameters = [
+        replace(estimate, harmless=is_harmless)
+        for estimate, is_harmless in zip(
+            itertools.islice(estimates, len(drafts)), harmless.tolist(), strict=True
+        )
+    ]
     ambiguities = [
         replace(ambiguity, determined=tuple(itertools.islice(estimates, len(combinations))))
         for ambiguity, combinations in tied
@@ -211,6 +222,7 @@ def uncertainty(
         ),
         succession=_succession(local),
         bent=_bent(local),
+        by_slopes=analysis.covariance.matrix,
     )
     joint, simultaneous = analysis.together([e.name for e in result.determined()])
     return replace(result, joint=joint, simultaneous=simultaneous)
@@ -520,6 +532,19 @@ class _Analysis:
         free = ~np.array(self.ties.bound, dtype=bool)
         pushed: BoolArray = self.on_bound & free & (outwards > Z95 * deviations)
         return pushed
+
+    def harmless_ends(self, estimates: Sequence[Estimate]) -> BoolArray:
+        """Parameters, (n_free,), on an end of their range that decides nothing."""
+        deviations = {name: self.covariance.deviation(g) for name, g in self.gradients.items()}
+
+        def changes(point: FloatArray) -> dict[str, float]:
+            return dict(zip(self.gradients, self._changes(point).tolist(), strict=True))
+
+        ends = RangeEnds(self.local, self.ties.directions, self.on_bound, changes, deviations)
+        harmless = self.on_bound & ~self.pushed
+        for j in np.flatnonzero(harmless).tolist():
+            harmless[j] = ends.decides_nothing(j, estimates)
+        return harmless
 
     def _is_guide(self, j: int, deviation: float) -> bool:
         """Whether the slopes at the estimate tell how far a parameter may be from it."""

@@ -41,7 +41,8 @@ class Estimate:
     ``tied`` (it acts only together with other parameters), ``vague`` (the data set no end on
     either side), ``rival`` (it has another value in a rival minimum; the interval is that around
     this one), or ``end`` (a combination that the data want beyond what the ranges allow). on_bound:
-    whether the value stands on an end of its range; pushed: whether the data want it beyond.
+    whether the value stands on an end of its range; pushed: whether the data want it beyond;
+    harmless: whether beyond it all else would be estimated alike.
     failing: share of the range in which the model cannot be simulated, where that ends the
     interval. combination: None of a parameter.
 
@@ -59,6 +60,7 @@ class Estimate:
     why: Why = ""
     on_bound: bool = False
     pushed: bool = False
+    harmless: bool = False
     failing: float = 0.0
     combination: Invariant | None = None
 

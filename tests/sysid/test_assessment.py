@@ -154,8 +154,9 @@ def test_without_validation_the_verdict_is_limited():
 
 
 def test_what_follows_an_input_is_named():
-    found = verdict([result(1, left=0.2)], [result(2, left=0.2)])
-    assert found.trust == "good", "one lag of fifty is chance"
+    assert verdict([result(1, left=0.005)], [result(2, left=0.005)]).trust == "good"
+    at_once = verdict([result(1, left=0.3)], [result(2, left=0.3)])
+    assert at_once.reasons[0].startswith("Residuals of speed still follow load"), "one lag of 50"
 
     def slow(seed):
         """The speed lacks a slow response to the load."""
@@ -173,9 +174,11 @@ def test_what_follows_an_input_is_named():
     # Seen in validation only, or in training for want of validation.
     assert "follow load" in verdict([slow(1)], []).reasons[1]
     assert "follow" not in " ".join(verdict([slow(1)], [result(2)]).reasons)
-    # In the mean of the records: of many, one or another is outside its bands by chance.
     assert "follow load" in verdict([slow(1)], [slow(2), slow(3), slow(4)]).reasons[0]
-    assert verdict([slow(1)], [slow(2), *(result(k) for k in range(3, 7))]).trust == "good"
+    # Of many records it is told of one, and of none by chance.
+    right = [result(k) for k in range(3, 23)]
+    assert verdict([slow(1)], right).trust == "good"
+    assert "follows load" in verdict([slow(1)], [slow(2), *right[:4]]).reasons[0]
 
 
 def test_a_trace_of_an_input_in_a_long_record_is_nothing_to_mend():
@@ -215,7 +218,7 @@ def test_an_error_several_times_as_large_may_still_be_a_small_one(size):
 
 def expected(noise, data, **systematic):
     nothing = np.zeros((*data.outputs.shape, 0))
-    return ExpectedErrors(np.array(noise), systematic.get("errors", nothing))
+    return ExpectedErrors(np.array(noise), np.zeros(len(noise)), systematic.get("errors", nothing))
 
 
 def test_errors_of_the_noise_alone_are_no_fault_however_large():

@@ -159,3 +159,17 @@ def test_units_and_offsets_matter_to_nothing(scale, shift, flip, seed):
     np.testing.assert_allclose(other.auto, plain.auto, atol=1e-9)
     np.testing.assert_allclose(other.cross, sign * plain.cross, atol=1e-9)
     np.testing.assert_allclose(other.cross_band, plain.cross_band, rtol=1e-9)
+
+
+@pytest.mark.parametrize("a, b", [(0.0, 0.0), (0.9, 0.95), (0.97, 0.97)])
+def test_correlations_at_all_lags_together_are_seldom_so_large_by_chance(a, b):
+    def chances(left):
+        for seed in range(200):
+            rng = np.random.default_rng([9, seed])
+            e, u = coloured(rng, 2000, a), coloured(rng, 2000, b)
+            yield residual_test((e + left * u)[:, None], u[:, None]).chance[0, 0]
+
+    alone = np.array([*chances(0.0)])
+    assert 0.005 < np.mean(alone < 0.05) < 0.11
+    assert np.mean(alone < 1e-3) < 0.02
+    assert np.mean(np.array([*chances(1.0)]) < 1e-3) > 0.8

@@ -719,6 +719,22 @@ def test_a_parameter_pushed_against_its_bound_counts_as_fixed_and_has_one_end():
     same_interval(parameters["a"], estimates(problem.tell(fixed={"b": 1.0}))["a"])
 
 
+@pytest.mark.parametrize("low, harmless", [(1e-4, True), (0.006, False)])
+def test_an_end_beyond_which_nothing_changes_is_harmless(low, harmless):
+    """Of b, which is next to nothing, and goes with a: at 0.006 it makes a another."""
+
+    def formula(p, u):
+        return columns((p["a"] + p["b"]) * u[:, 0] + 0.3 * p["b"] * u[:, 1])
+
+    problem = Problem(formula, [unknown("a", 3.0), unknown("b", 1e-6, lower=1e-9, upper=10.0)])
+    ended = estimates(problem.tell(ranges={"b": (low, 10.0)}))
+    free = estimates(problem.tell(ranges={"b": (1e-3 * low, 10.0)}))
+    assert ended["b"].on_bound and not ended["b"].pushed and not ended["a"].harmless
+    assert ended["b"].harmless is harmless
+    moved = abs(ended["a"].value - free["a"].value) / free["a"].deviation
+    assert (moved < 0.5) is harmless
+
+
 @pytest.mark.parametrize(("ends", "why"), [((1.0, 2.0), ""), ((1.0, 1.2), "end")])
 def test_a_combination_that_the_data_want_beyond_its_ranges_has_no_interval(ends, why):
     """The true product is 1.5; ranges of its factors end at 2 or at 1.2."""

@@ -1,0 +1,94 @@
+"""Ends of ranges that decide nothing, though an estimate stands on them.
+
+Of a friction that data hardly feel any small value explains them, and an estimate may stand on the
+low end of its range by chance. That end decides nothing if all would be estimated alike beyond it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import null_space
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.uncertainty.covariance import Covariance, covariance
+from sysid.uncertainty.estimate import Estimate
+from sysid.uncertainty.sensitivity import Sensitivity
+
+_FACTOR = 10.0  # of a parameter searched by its logarithm; another goes by the width of its range
+_UNMOVED = 0.5  # deviations
+
+
+@dataclass(frozen=True)
+class RangeEnds:
+    """Ends of ranges on which an estimate stands.
+
+    ties: (n, n_free), directions that leave the outputs alone. on_bound: (n_free,). changes: how
+    far quantities, by name, are at search coordinates (n_free,) from the estimate; deviations:
+    standard deviations of these.
+    """
+
+    local: Sensitivity
+    ties: FloatArray
+    on_bound: BoolArray
+    changes: Callable[[FloatArray], Mapping[str, float]]
+    deviations: Mapping[str, float]
+
+    def decides_nothing(self, j: int, estimates: Sequence[Estimate]) -> bool:
+        """Whether beyond the end of parameter j all else would be estimated alike.
+
+        Or be where its interval has no end. By the slopes, as where ties would lead inside again;
+        or by a run beyond, as where a parameter does next to nothing at that end, and the slope
+        over its logarithm would lead far.
+        """
+        space, held = self.local.objective.space, self.on_bound.copy()
+        combined = [e for e in estimates if e.combination and space.names[j] in e.combination.names]
+        if any(estimate.why == "end" for estimate in combined):
+            return False
+        inverse = self._with(held).curvature
+        held[j] = False
+        by_slopes = space.encode(self.local.chromosome) + self._with(held).newton_step
+        others = [estimate for estimate in estimates if estimate.name != space.names[j]]
+        return self._alike(by_slopes, others) or self._alike(self._beyond(j, inverse), others)
+
+    def _with(self, held: BoolArray) -> Covariance:
+        """The covariance with parameters held, (n_free,), which ends the ties that they are in."""
+        ties = self.ties
+        if len(ties):
+            ties = null_space(ties[:, held].T).T @ ties
+        return covariance(self.local, ties, held)
+
+    def _beyond(self, j: int, inverse: FloatArray) -> FloatArray:
+        """Search coordinates, (n_free,), of the minimum with parameter j beyond its end.
+
+        inverse: (n_free, n_free), inverse curvature of all that stand on no end: they follow by
+        their slopes. NaN where a simulation fails beyond.
+        """
+        local, objective, at = self.local, self.local.objective, self.local.chromosome
+        space = objective.space
+        low = space.encode(at)[j] - space.coded_lower[j] < 0.5 * space.width[j]
+        beyond = at[j] / _FACTOR if low else at[j] * _FACTOR
+        if not space.log[j]:
+            beyond = at[j] + (-space.width[j] if low else space.width[j])
+        there, parameter = at.copy(), space.parameters[j]
+        there[j] = min(max(beyond, parameter.minimum), parameter.maximum)
+        values = objective.residuals(np.stack([at, there]), local.steps).values
+        change = local.share * (values[..., 1] - values[..., 0])
+        weights = objective.least_squares_weights(local.residual)
+        push = np.einsum("tip,i,ti->p", local.slopes, weights, change)
+        minimum: FloatArray = space.encode(there) - inverse @ push
+        return minimum
+
+    def _alike(self, point: FloatArray, estimates: Sequence[Estimate]) -> bool:
+        """Whether quantities are at search coordinates (n_free,) as they are estimated.
+
+        Or on a side on which they have no end. Not where a simulation has failed, which is NaN.
+        """
+        changes = self.changes(point)
+        return all(
+            abs(changes[estimate.name]) <= _UNMOVED * self.deviations[estimate.name]
+            or (changes[estimate.name] < 0.0 and estimate.low is None)
+            or (changes[estimate.name] > 0.0 and estimate.high is None)
+            for estimate in estimates
+            if estimate.name in changes
+        )
