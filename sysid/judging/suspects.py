@@ -205,18 +205,28 @@ def _with_play(run: DisturbedRun, i: int, width: float) -> FloatArray:
 def _acted_before(run: DisturbedRun, i: int, time: float) -> FloatArray:
     """What is logged late has acted before."""
     held = run.model.inputs[i].hold == "zoh"
-    return _shifted(run.record.inputs[:, i], time / run.record.dt, held)
+    return _shifted(_acting(run, i), time / run.record.dt, held)
 
 
 def _unfiltered(run: DisturbedRun, i: int, time: float) -> FloatArray:
     """What acted, of which a filter was logged, was steeper."""
-    signal, pole = run.record.inputs[:, i], np.exp(-run.record.dt / time)
+    signal, pole = _acting(run, i), np.exp(-run.record.dt / time)
     change: FloatArray = np.diff(signal, prepend=signal[0]) * pole / (1.0 - pole)
     return change
 
 
 def _lagging(run: DisturbedRun, i: int, time: float) -> FloatArray:
-    return _smoothed(run.record.inputs[:, i], time / run.record.dt)
+    return _smoothed(_acting(run, i), time / run.record.dt)
+
+
+def _acting(run: DisturbedRun, i: int) -> FloatArray:
+    """An input (n_samples,) without what of it is likely to be noise, which has not acted.
+
+    How the noise would be shifted seems to tell a delay far better than the signal does, and what
+    it does by its second power, next to nothing, to be one.
+    """
+    signal, deviation = run.record.inputs[:, i], float(run.record.input_noise[i])
+    return signal - likely_noise(signal, deviation) if deviation else signal
 
 
 _LATE_INPUTS: dict[Kind, _Change] = {

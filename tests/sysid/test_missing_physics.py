@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from benchmarks._stress_cases import (
     DT,
@@ -23,9 +24,11 @@ from benchmarks._stress_cases import (
 )
 from benchmarks.stress import fitted, tried
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
+from sysid.examples import lag
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.examination import suspected, verdict_of
+from sysid.judging.suspects import channel_suspects
 from sysid.judging.whitener import colour_about_line
 from tests.soak import mostly_soak
 from tests.sysid.reference import simulate
@@ -300,6 +303,43 @@ def test_rates_along_a_run_are_those_at_each_of_its_points(derivative):
     points = zip(run.states, training.inputs, strict=True)
     expected = [derivative(tuple(x), tuple(u), tuple(vector)) for x, u in points]
     np.testing.assert_allclose(run.rates_of(derivative, vector), expected, rtol=1e-12)
+
+
+def slow_input(seed, late=0):
+    """A lag under an input that was logged with as much noise as a third, so many samples late."""
+    rng, n = np.random.default_rng([5, seed]), 1500
+    acting = lfilter([0.2], [1.0, -0.8], np.repeat(rng.uniform(-1.0, 1.0, n // 50), 50))
+    logged = np.concatenate([np.zeros(late), acting[: n - late]])
+    blank = Dataset(acting, np.full((n, 1), np.nan), 0.002)
+    simulator = BatchSimulator(lag(), accuracy=1e-7)
+    y = simulator.trajectories(np.array([2.0, 0.05]), blank, None, np.zeros((1, 1)))[0]
+    noise = {"input_noise": np.array([0.3]), "output_noise": np.array([0.002])}
+    seen = logged + 0.3 * rng.standard_normal(n)
+    return Dataset(seen, y + 0.002 * rng.standard_normal(y.shape), 0.002, **noise)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_noisy_input_is_late_if_it_is_and_not_else(seed):
+    for late in (0, 5):
+        record = slow_input(seed, late)
+        estimator = GASSI(lag(), population=20, generations=3, random_state=seed).fit(record)
+        suspicion = suspected(estimator, estimator.uncertainty([record]), [record])
+        found = [(f.kind, f.name, f.amplitude) for f in suspicion.findings]
+        assert found == ([("delay", "u", pytest.approx(0.01, rel=0.35))] if late else [])
+
+
+def test_what_a_delay_makes_of_noise_is_not_looked_for():
+    """It would tell one of a fraction of a sample, where the noise itself is what was seen."""
+    record = slow_input(0)
+    noise = replace(record, inputs=0.3 * np.random.default_rng(1).standard_normal((1500, 1)))
+    known_noise, unknown = (
+        next(s.changes for s in channel_suspects([run]) if (s.kind, s.of_input) == ("delay", True))
+        for run in (
+            DisturbedRun(lag(), np.array([2.0, 0.05]), each, np.zeros(1))
+            for each in (noise, replace(noise, input_noise=np.zeros(1)))
+        )
+    )
+    assert np.linalg.norm(known_noise) < 0.4 * np.linalg.norm(unknown)
 
 
 HYSTERESIS = ProcessModel(
