@@ -9,6 +9,7 @@ likelihood, which may end on one side only.
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
@@ -18,7 +19,6 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
-from sysid.problem.space import ON_BOUND
 from sysid.uncertainty.colour import successive_correlation
 from sysid.uncertainty.covariance import covariance, larger
 from sysid.uncertainty.ends import RangeEnds
@@ -189,7 +189,7 @@ def uncertainty(
         drafts = [d if j in profiled else replace(d, tracer=None) for j, d in enumerate(drafts)]
     tied = list(analysis.ambiguities())
     combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
-    settled = analysis.settled([*drafts, *combined])
+    settled = analysis.opened(analysis.settled([*drafts, *combined]))
     harmless = analysis.harmless_ends(settled)
     whole = (_with_bottoms(estimate, bottoms) for estimate in settled)
     estimates = iter(map(judged, whole))
@@ -533,18 +533,27 @@ class _Analysis:
         pushed: BoolArray = self.on_bound & free & (outwards > Z95 * deviations)
         return pushed
 
+    def opened(self, estimates: Sequence[Estimate]) -> Sequence[Estimate]:
+        """Estimates without the ends of profiles that are those of ranges."""
+        if not (self.on_bound & ~self.pushed).any():
+            return estimates
+        return self._range_ends.opened(self.coded + self.covariance.newton_step, estimates)
+
     def harmless_ends(self, estimates: Sequence[Estimate]) -> BoolArray:
         """Parameters, (n_free,), on an end of their range that decides nothing."""
+        harmless = self.on_bound & ~self.pushed
+        for j in np.flatnonzero(harmless).tolist():
+            harmless[j] = self._range_ends.decides_nothing(j, estimates)
+        return harmless
+
+    @cached_property
+    def _range_ends(self) -> RangeEnds:
         deviations = {name: self.covariance.deviation(g) for name, g in self.gradients.items()}
 
         def changes(point: FloatArray) -> dict[str, float]:
             return dict(zip(self.gradients, self._changes(point).tolist(), strict=True))
 
-        ends = RangeEnds(self.local, self.ties.directions, self.on_bound, changes, deviations)
-        harmless = self.on_bound & ~self.pushed
-        for j in np.flatnonzero(harmless).tolist():
-            harmless[j] = ends.decides_nothing(j, estimates)
-        return harmless
+        return RangeEnds(self.local, self.ties.directions, self.on_bound, changes, deviations)
 
     def _is_guide(self, j: int, deviation: float) -> bool:
         """Whether the slopes at the estimate tell how far a parameter may be from it."""
@@ -581,7 +590,7 @@ class _Analysis:
         positive = bool(np.all(self.space.log[gradient != 0.0])) and value > 0.0
         moved = gradient / value if positive else gradient
         quantity = Expression(self.space, combination, positive)
-        if self._wanted_beyond(quantity, moved):
+        if self._wanted_beyond(combination, moved):
             return _Draft(replace(estimate, why="end"))
         tracer = Tracer(self.local, self.covariance, moved, quantity)
         narrow = np.isfinite(deviation) and (not positive or deviation < _WEAK * value)
@@ -594,16 +603,16 @@ class _Analysis:
             low, high = (value + sign * Z95 * deviation for sign in _SIDES)
         return _Draft(replace(estimate, std=deviation, low=float(low), high=float(high)), tracer)
 
-    def _wanted_beyond(self, quantity: Expression, gradient: FloatArray) -> bool:
+    def _wanted_beyond(self, combination: Invariant, gradient: FloatArray) -> bool:
         """Whether the data push what changes so (n_free,) beyond what ranges of its members allow.
 
         Of a parameter its one end tells that, and that it stands there; of a combination nothing.
         """
-        place, near = quantity.at(self.coded), ON_BOUND * quantity.width
+        members = np.isin(self.space.names, combination.names)
+        if not self.on_bound[members].any():
+            return False
         step, deviation = gradient @ self.free.newton_step, self.free.deviation(gradient)
-        outwards = -step if place < quantity.ends[0] + near else step
-        at_end = place < quantity.ends[0] + near or place > quantity.ends[1] - near
-        return bool(at_end and outwards > Z95 * deviation)
+        return bool(abs(step) > Z95 * deviation)
 
     def settled(self, drafts: Sequence[_Draft]) -> list[Estimate]:
         """Estimates with the ends that profiles tell.

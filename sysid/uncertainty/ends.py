@@ -5,7 +5,7 @@ low end of its range by chance. That end decides nothing if all would be estimat
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import null_space
@@ -50,6 +50,23 @@ class RangeEnds:
         by_slopes = space.encode(self.local.chromosome) + self._with(held).newton_step
         others = [estimate for estimate in estimates if estimate.name != space.names[j]]
         return self._alike(by_slopes, others) or self._alike(self._beyond(j, inverse), others)
+
+    def opened(self, freed: FloatArray, estimates: Sequence[Estimate]) -> list[Estimate]:
+        """Estimates without the ends of profiles that these ends of ranges have set.
+
+        freed: search coordinates (n_free,) of the minimum, had ranges no ends.
+        """
+        changes = self.changes(freed)
+        return [self._opened(estimate, changes.get(estimate.name, 0.0)) for estimate in estimates]
+
+    def _opened(self, estimate: Estimate, change: float) -> Estimate:
+        """An estimate that would be another by a change."""
+        traced = estimate.std is None and not estimate.why
+        if not traced or not abs(change) > _UNMOVED * self.deviations.get(estimate.name, np.inf):
+            return estimate
+        opened = replace(estimate, low=None) if change < 0.0 else replace(estimate, high=None)
+        vague = opened.low is None and opened.high is None
+        return replace(opened, why="vague") if vague else opened
 
     def _with(self, held: BoolArray) -> Covariance:
         """The covariance with parameters held, (n_free,), which ends the ties that they are in."""

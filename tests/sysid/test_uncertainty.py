@@ -735,6 +735,35 @@ def test_an_end_beyond_which_nothing_changes_is_harmless(low, harmless):
     assert (moved < 0.5) is harmless
 
 
+def test_where_ranges_of_tied_parameters_end_a_profile_there_is_no_end():
+    """R / L is known, so with R / K it ends at the least L and the largest K."""
+
+    def formula(p, u):
+        return columns(p["R"] / p["L"] * u[:, 0], 3.0 * p["R"] / p["K"] * u[:, 1])
+
+    parameters = [unknown("R", 1.0), unknown("L", 0.1), unknown("K", 300.0)]
+    quotients = (
+        Formulated("R / L", ("R", "L"), lambda r, inductance: r / inductance),
+        Formulated("R / K", ("R", "K"), lambda r, k: r / k),
+    )
+
+    def within(sigma, least):
+        problem = Problem(formula, parameters, sigma=sigma, seed=2)
+        result = problem.tell(*quotients, ranges={"L": (least, 1.0), "K": (1.0, 200.0)})
+        return result, combinations(result)
+
+    (_, wide), (narrow, ended) = within(0.1, 0.001), within(0.1, 0.1)
+    assert 0.0 < wide["R / K"].low < 1.0 / 300.0 < wide["R / K"].high
+    assert ended["R / K"].low is None and ended["R / K"].high > 1.0 / 300.0
+    assert ended["R / L"].low < 10.0 < ended["R / L"].high
+    at_ends = [e for e in narrow.parameters if e.on_bound]
+    assert [e.name for e in at_ends] == ["L", "K"] and all(e.harmless for e in at_ends)
+    # Where the data tell that it is beyond, by many deviations, there is no interval.
+    sure, ended = within(0.01, 0.1)
+    assert {e.why for e in ended.values()} == {"end"}
+    assert not any(e.harmless for e in sure.parameters)
+
+
 @pytest.mark.parametrize(("ends", "why"), [((1.0, 2.0), ""), ((1.0, 1.2), "end")])
 def test_a_combination_that_the_data_want_beyond_its_ranges_has_no_interval(ends, why):
     """The true product is 1.5; ranges of its factors end at 2 or at 1.2."""
