@@ -537,7 +537,7 @@ class _Analysis:
         """Estimates without the ends of profiles that are those of ranges."""
         if not (self.on_bound & ~self.pushed).any():
             return estimates
-        return self._range_ends.opened(self.coded + self.covariance.newton_step, estimates)
+        return self._range_ends.opened(self.covariance, estimates)
 
     def harmless_ends(self, estimates: Sequence[Estimate]) -> BoolArray:
         """Parameters, (n_free,), on an end of their range that decides nothing."""

@@ -17,6 +17,7 @@ from sysid.uncertainty.sensitivity import Sensitivity
 
 _FACTOR = 10.0  # of a parameter searched by its logarithm; another goes by the width of its range
 _UNMOVED = 0.5  # deviations
+_FARTHEST = 30.0  # ranges, beyond which there are no numbers
 
 
 @dataclass(frozen=True)
@@ -47,16 +48,18 @@ class RangeEnds:
             return False
         inverse = self._with(held).curvature
         held[j] = False
-        by_slopes = space.encode(self.local.chromosome) + self._with(held).newton_step
         others = [estimate for estimate in estimates if estimate.name != space.names[j]]
-        return self._alike(by_slopes, others) or self._alike(self._beyond(j, inverse), others)
+        if self._alike(self._by_slopes(self._with(held)), others):
+            return True
+        beyond = self._beyond(j, inverse)
+        return beyond is not None and self._alike(beyond, others)
 
-    def opened(self, freed: FloatArray, estimates: Sequence[Estimate]) -> list[Estimate]:
+    def opened(self, free: Covariance, estimates: Sequence[Estimate]) -> list[Estimate]:
         """Estimates without the ends of profiles that these ends of ranges have set.
 
-        freed: search coordinates (n_free,) of the minimum, had ranges no ends.
+        free: with no parameter held.
         """
-        changes = self.changes(freed)
+        changes = self.changes(self._by_slopes(free))
         return [self._opened(estimate, changes.get(estimate.name, 0.0)) for estimate in estimates]
 
     def _opened(self, estimate: Estimate, change: float) -> Estimate:
@@ -68,6 +71,13 @@ class RangeEnds:
         vague = opened.low is None and opened.high is None
         return replace(opened, why="vague") if vague else opened
 
+    def _by_slopes(self, covariance: Covariance) -> FloatArray:
+        """Where the minimum would be, (n_free,), by the slopes."""
+        space = self.local.objective.space
+        step = np.clip(covariance.newton_step, -_FARTHEST * space.width, _FARTHEST * space.width)
+        minimum: FloatArray = space.encode(self.local.chromosome) + step
+        return minimum
+
     def _with(self, held: BoolArray) -> Covariance:
         """The covariance with parameters held, (n_free,), which ends the ties that they are in."""
         ties = self.ties
@@ -75,11 +85,11 @@ class RangeEnds:
             ties = null_space(ties[:, held].T).T @ ties
         return covariance(self.local, ties, held)
 
-    def _beyond(self, j: int, inverse: FloatArray) -> FloatArray:
+    def _beyond(self, j: int, inverse: FloatArray) -> FloatArray | None:
         """Search coordinates, (n_free,), of the minimum with parameter j beyond its end.
 
         inverse: (n_free, n_free), inverse curvature of all that stand on no end: they follow by
-        their slopes. NaN where a simulation fails beyond.
+        their slopes. None where a simulation fails beyond.
         """
         local, objective, at = self.local, self.local.objective, self.local.chromosome
         space = objective.space
@@ -90,6 +100,8 @@ class RangeEnds:
         there, parameter = at.copy(), space.parameters[j]
         there[j] = min(max(beyond, parameter.minimum), parameter.maximum)
         values = objective.residuals(np.stack([at, there]), local.steps).values
+        if not np.all(np.isfinite(values)):
+            return None
         change = local.share * (values[..., 1] - values[..., 0])
         weights = objective.least_squares_weights(local.residual)
         push = np.einsum("tip,i,ti->p", local.slopes, weights, change)
@@ -97,10 +109,7 @@ class RangeEnds:
         return minimum
 
     def _alike(self, point: FloatArray, estimates: Sequence[Estimate]) -> bool:
-        """Whether quantities are at search coordinates (n_free,) as they are estimated.
-
-        Or on a side on which they have no end. Not where a simulation has failed, which is NaN.
-        """
+        """Whether quantities at a point, (n_free,), are as estimated, or on a side without end."""
         changes = self.changes(point)
         return all(
             abs(changes[estimate.name]) <= _UNMOVED * self.deviations[estimate.name]
