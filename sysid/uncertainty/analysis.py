@@ -190,7 +190,7 @@ def uncertainty(
     tied = list(analysis.ambiguities())
     combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
     settled = analysis.opened(analysis.settled([*drafts, *combined]))
-    harmless = analysis.harmless_ends(settled)
+    harmless = analysis.harmless_ends(settled, profiled)
     whole = (_with_bottoms(estimate, bottoms) for estimate in settled)
     estimates = iter(map(judged, whole))
     parameters = [
@@ -539,9 +539,16 @@ class _Analysis:
             return estimates
         return self._range_ends.opened(self.covariance, estimates)
 
-    def harmless_ends(self, estimates: Sequence[Estimate]) -> BoolArray:
-        """Parameters, (n_free,), on an end of their range that decides nothing."""
+    def harmless_ends(
+        self, estimates: Sequence[Estimate], places: Sequence[int] | None
+    ) -> BoolArray:
+        """Parameters, (n_free,), on an end of their range that decides nothing.
+
+        places: of those for which that is asked, default all.
+        """
         harmless = self.on_bound & ~self.pushed
+        if places is not None:
+            harmless &= np.isin(np.arange(len(harmless)), places)
         for j in np.flatnonzero(harmless).tolist():
             harmless[j] = self._range_ends.decides_nothing(j, estimates)
         return harmless
