@@ -20,6 +20,7 @@ from daq.files import make_folder, write_whole
 from daq.identification.earlier_fit import EarlierFit
 from daq.identification.request import PARAMETERS
 from daq.logs.capture import COMPLETED, INTERLOCK, RUN_NAME
+from sysid.gassi import EarlierMinima
 
 _REQUEST = "characterise.json"
 _RUNS, _IDENTIFICATION = "runs", "identification"
@@ -186,18 +187,19 @@ class Round:
         ]
 
     @property
-    def as_earlier_fit(self) -> EarlierFit | None:
-        """Where an identification with more logs begins; None where this one leaves things open."""
+    def as_earlier_fit(self) -> EarlierFit:
+        """Where an identification with more logs begins."""
         result, intervals = self.result, self.intervals()
-        poor = result["verdict"]["parameters"]["trust"] == "poor"
-        nowhere = any(i.low is None and i.high is None for i in intervals)
-        if poor or result.get("rivals") or nowhere:
-            return None
         values = {name: float(entry["value"]) for name, entry in result["parameters"].items()}
         ends = {
             i.name: (i.low, i.high) for i in intervals if i.low is not None if i.high is not None
         }
-        return EarlierFit(values, ends)
+        rivals = [rival["parameters"] for rival in result.get("rivals") or ()]
+        noise = result["criterion"].get("noise") or {}
+        poor = result["verdict"]["parameters"]["trust"] == "poor"
+        nowhere = any(i.low is None and i.high is None for i in intervals)
+        settled = not (poor or rivals or nowhere)
+        return EarlierFit(EarlierMinima([values, *rivals], noise, settled), ends)
 
 
 def _interval(quantity: Mapping[str, Any], entry: Mapping[str, Any]) -> Interval:

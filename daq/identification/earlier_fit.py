@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sysid.gassi import EarlierMinima
 from sysid.judging.assessment import coloured_innovations
 
 if TYPE_CHECKING:
@@ -16,12 +17,12 @@ _FARTHEST = 2.0  # half widths of its interval, by which more logs may move a qu
 
 @dataclass(frozen=True)
 class EarlierFit:
-    """Where an identification from some of the logs has ended, and left nothing open.
+    """Where an identification from some of the logs has ended.
 
-    values: parameters by name. intervals: the 95 % intervals of all that logs can tell.
+    minima: where. intervals: the 95 % intervals of all that logs can tell.
     """
 
-    values: Mapping[str, float]
+    minima: EarlierMinima
     intervals: Mapping[str, tuple[float, float]]
 
     def is_near(self, values: Mapping[str, float]) -> bool:

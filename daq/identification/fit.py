@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from daq.identification.draft import Draft, Missing
     from daq.identification.earlier_fit import EarlierFit
-    from sysid.gassi import GASSI
+    from sysid.gassi import GASSI, EarlierMinima
     from sysid.gassi import Progress as SearchProgress
     from sysid.uncertainty import Uncertainty
 
@@ -139,7 +139,8 @@ def fit(
     folder: for ``parameters.yaml``, and while the search runs for what it takes to continue it.
     resume: continue from there. examine: whether what the model may lack is to be tested, which
     may take longer than the fit. draft: what else can be done meanwhile. earlier: where some of the
-    logs have led; nothing is searched for unless all of them disagree. Raises ConfigError.
+    logs have led; if these left nothing open, nothing is searched for unless all of them disagree,
+    and a search begins there as well. Raises ConfigError.
     """
     train, check = load_logs(problem, training, validation)
     warn(watch, *(log.warning for log in (*train, *check)))
@@ -158,10 +159,11 @@ def fit(
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     try:
         result, missing = None, None
-        if earlier is not None and not resume:
+        if earlier is not None and earlier.minima.is_settled and not resume:
             result = _beside(earlier, problem, logs, folder, watch, faults)
         if result is None:
-            estimator = _searched(problem, train, folder, watch, resume)
+            minima = None if earlier is None else replace(earlier.minima, is_settled=False)
+            estimator = _searched(problem, train, folder, watch, resume, minima)
             problem = problem.starting(estimator.estimated_starts_)
             tell_starts(estimator.estimated_starts_, watch)
             datasets = [log.dataset for log in train]
@@ -191,7 +193,7 @@ def _beside(
 ) -> Identification | None:
     """The minimum of all logs beside that of some; None where it is not the right one."""
     with contextlib.suppress(ConfigError):  # a simulation that fails there
-        estimator = _searched(problem, logs[0], None, watch, False, earlier.values)
+        estimator = _searched(problem, logs[0], None, watch, False, earlier.minima)
         interrupted = estimator.stopped_ == "interrupted"
         if interrupted or earlier.is_near(estimator.parameters_):
             problem = problem.starting(estimator.estimated_starts_)
@@ -395,7 +397,7 @@ def _searched(
     folder: Path | None,
     watch: Watch,
     resume: bool,
-    begin: Mapping[str, float] | None = None,
+    earlier: EarlierMinima | None,
 ) -> GASSI:
     from sysid.gassi import GASSI
 
@@ -415,7 +417,7 @@ def _searched(
             on_progress=report,
             checkpoint=checkpoint,
             resume=checkpoint if resume else None,
-            begin=begin,
+            earlier=earlier,
         )
     except ModelError as error:
         if folder is not None and not resume:

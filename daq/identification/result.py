@@ -288,7 +288,7 @@ class Identification(Shown):
             "model": self.problem.model_name,
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
-            "criterion": {"name": estimator.criterion_, "reason": estimator.criterion_reason_},
+            "criterion": _criterion(self),
             **({"averaged": averaged} if (averaged := _averaged(self)) else {}),
             **({"preparation": prepared} if (prepared := _preparation(self)) else {}),
             "verdict": _verdict(verdict),
@@ -564,6 +564,16 @@ def _in_parts_of_noise(result: RecordResult, j: int) -> dict[str, float]:
         return {}
     figures = {"ratio": result.floor.ratio[j], "p_value": result.floor.p_value[j]}
     return {f"residual_to_noise_{key}": float(f"{value:.4g}") for key, value in figures.items()}
+
+
+def _criterion(result: Identification) -> dict[str, Any]:
+    """What the fit ended with, and the outputs' noise by which a filter did, in their units."""
+    estimator = result.estimator
+    criterion = {"name": estimator.criterion_, "reason": estimator.criterion_reason_}
+    if estimator.criterion_ != "innovations" or estimator.output_noise_ is None:
+        return criterion
+    noise = map(float, estimator.output_noise_)
+    return {**criterion, "noise": dict(zip(result.model.output_names, noise, strict=True))}
 
 
 def _averaged(result: Identification) -> dict[str, str]:

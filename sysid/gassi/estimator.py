@@ -20,10 +20,11 @@ from sysid.fitting.objective import Balance, Objective
 from sysid.fitting.refinement import begin, refine_each
 from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
+from sysid.gassi.earlier_minima import EarlierMinima
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.first_samples import noticed_starts, with_starts
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
-from sysid.gassi.likelihood import NoisyInputs, fit_likelihood, promising
+from sysid.gassi.likelihood import Begun, NoisyInputs, fit_likelihood, promising
 from sysid.gassi.nudged import nudged
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
@@ -208,7 +209,7 @@ class GASSI(RecordEstimator):
         on_progress: Callable[[Progress], None] | None = None,
         checkpoint: Path | None = None,
         resume: Path | None = None,
-        begin: Mapping[str, float] | None = None,
+        earlier: EarlierMinima | None = None,
     ) -> Self:
         """Search for the parameters with which the model follows the records.
 
@@ -220,9 +221,10 @@ class GASSI(RecordEstimator):
         checkpoint: file that the search's whole state is written to, at most twice a second.
         resume: such a file to go on from, to the same result; further checkpoints go to the same
         file unless another is named.
-        begin: of presets that refine, parameters by name, at which a fit of some of the records
-        has ended, and which these told from all others. Nothing is searched for then: the result
-        is the minimum beside them, of which it is taken that no other looks like it.
+        earlier: of presets that refine, where a fit of some of the records has ended. Descents
+        begin there as well, so that the result explains all of the records no worse than the minima
+        beside it. If it is settled nothing is searched for: the result is the minimum beside it,
+        and it is taken that no other looks like it.
 
         Raises ModelError when every simulation of the first generation fails, for records without
         information, settings that make no sense, or a checkpoint of other data, settings or model.
@@ -255,14 +257,14 @@ class GASSI(RecordEstimator):
         self.excerpt_ = self._excerpt(data) if preset.refine else None
         searched = self._searched(objective)
         objective = objective if self._cut is None else self._cut.among(objective)
-        begin = begin if preset.refine else None
-        run = self._search_run(searched, preset, begin)
+        earlier = earlier if preset.refine else None
+        run = self._search_run(searched, preset, earlier)
         checkpoints = self._checkpoints(data, run, checkpoint, resume)
         notify = on_progress or (lambda progress: None)
         self.stopped_ = self._search(run, checkpoints, notify)
         self._set_run(run)
         try:
-            self._conclude(run, objective, notify, settled=begin is not None)
+            self._conclude(run, objective, notify, earlier)
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
         return self
@@ -294,12 +296,11 @@ class GASSI(RecordEstimator):
         run: SearchRun,
         objective: Objective,
         notify: Callable[[Progress], None],
-        *,
-        settled: bool,
+        earlier: EarlierMinima | None,
     ) -> None:
         """Fit the minima of a search to all of the records, and keep the best.
 
-        objective: of the records, over the parameters alone. settled: whether there are no others.
+        objective: of the records, over the parameters alone. earlier: as of ``fit``.
         """
         iterations = itertools.count(1)
 
@@ -307,50 +308,62 @@ class GASSI(RecordEstimator):
             done = next(iterations)
             notify(Progress("weigh", done, done, self.error_))
 
-        searched, excerpt, weighs = run.objective, self.excerpt_, self.criterion_ != "error"
+        excerpt, fitted = self.excerpt_, run.objective
         if excerpt is not None:
             space, (chromosome,) = self._on_fitted(run, objective, [self.final_chromosome_])
-            objective = objective.over(space)
-            self._set_evaluated(objective, chromosome)
+            fitted = objective.over(space)
+            self._set_evaluated(fitted, chromosome)
         if self.stopped_ == "interrupted" or not self._preset().refine:
             return
+        if self.criterion_ != "error":
+            begun = Begun.of(earlier, fitted, run.begun)
+            minima = self._promising(run, fitted, watch, lookalike=not begun.is_settled)
+            self._maximise_likelihood(fitted, minima, watch, begun)
+        elif excerpt is not None:
+            minima = self._on_fitted(run, fitted, run.minima())[1]
+            ends = refine_each(fitted, [begin(fitted, each) for each in minima])
+            best = min(ends, key=lambda end: (not space.feasible(end.chromosome), end.error))
+            self._set_evaluated(fitted, best.chromosome)
+
+    def _promising(
+        self,
+        run: SearchRun,
+        objective: Objective,
+        watch: Callable[[Point], None],
+        *,
+        lookalike: bool,
+    ) -> list[FloatArray]:
+        """Minima (n_free,) of a search, of an excerpt's those that all of the records may favour.
+
+        objective: of the records. lookalike: whether others may look like them.
+        """
+        excerpt, minima = self.excerpt_, run.minima()
         if excerpt is None:
-            if weighs:
-                self._maximise_likelihood(searched, run.minima(), watch, settled=settled)
-            return
-        if weighs:
-            minima = run.minima()
-            if excerpt.cut:
-                searched, minima = objective, self._on_fitted(run, objective, minima)[1]
-            # What looks like a filter's minimum it tells itself, by all of the records.
-            lookalike = not settled and self.criterion_ != "innovations"
-            most = _ALIKE_BY_PARTS if excerpt.cut else _ALIKE_BY_ALL
-            minima = promising(searched, minima, watch, lookalike=lookalike, most=most)
-            if not excerpt.cut:
-                minima = excerpt.on_all(searched.space, minima)[1]
-            self._maximise_likelihood(objective, minima, watch, explored=True, settled=settled)
-            return
-        minima = self._on_fitted(run, objective, run.minima())[1]
-        ends = refine_each(objective, [begin(objective, minimum) for minimum in minima])
-        best = min(ends, key=lambda end: (not space.feasible(end.chromosome), end.error))
-        self._set_evaluated(objective, best.chromosome)
+            return minima
+        searched = run.objective
+        if excerpt.cut:
+            searched, minima = objective, self._on_fitted(run, objective, minima)[1]
+        # What looks like a filter's minimum it tells itself, by all of the records.
+        lookalike = lookalike and self.criterion_ != "innovations"
+        most = _ALIKE_BY_PARTS if excerpt.cut else _ALIKE_BY_ALL
+        minima = promising(searched, minima, watch, lookalike=lookalike, most=most)
+        return minima if excerpt.cut else excerpt.on_all(searched.space, minima)[1]
 
     def _maximise_likelihood(
         self,
         objective: Objective,
         minima: Sequence[FloatArray],
         watch: Callable[[Point], None],
-        *,
-        explored: bool = False,
-        settled: bool = False,
+        begun: Begun,
     ) -> None:
         """Refit the minima of the mean RMSE by likelihood, and keep the likeliest.
 
-        explored, settled: as of ``fit_likelihood``.
+        begun: as of ``fit_likelihood``.
         """
         noise, process = _OF_NOISY_INPUTS.get(self.criterion_), self._process()
-        fit = partial(fit_likelihood, watch=watch, noise=noise, process=process, settled=settled)
-        result = fit(objective, minima, explored=explored)
+        fit = partial(fit_likelihood, watch=watch, noise=noise, process=process)
+        explored = self.excerpt_ is not None
+        result = fit(objective, minima, begun=begun, explored=explored)
         likeliest = result.optimum
         if not (isinstance(likeliest.objective, Innovations) and likeliest.objective.corrects):
             fitted, chromosome = likeliest.objective, likeliest.chromosome
@@ -358,7 +371,7 @@ class GASSI(RecordEstimator):
         if self.estimated_starts_:
             minima = [likeliest.chromosome, *result.rivals]
             objective, minima = self._with_starts(objective, minima)
-            result = fit(objective, minima, explored=True)
+            result = fit(objective, minima, begun=replace(begun, chromosomes=()), explored=True)
         likeliest, self._rivals, self._ridge = result.optimum, result.rivals, result.ridge
         self._final_accuracy = likeliest.objective.simulator.accuracy
         self._set_evaluated(self._at_final_accuracy(objective), likeliest.chromosome)
@@ -652,7 +665,7 @@ class GASSI(RecordEstimator):
         return weights
 
     def _search_run(
-        self, objective: Objective, preset: Preset, begin: Mapping[str, float] | None
+        self, objective: Objective, preset: Preset, earlier: EarlierMinima | None
     ) -> SearchRun:
         # The genetic search gets its share of the generations, local refinement the rest.
         generations = self.generations
@@ -661,13 +674,14 @@ class GASSI(RecordEstimator):
         rng = np.random.default_rng(self.random_state)
         rule = self.elite_percent, self.minimum_generations, self.termination_ratio
         population, chromosome = self.population, None
-        if begin is not None:
+        begun = [] if earlier is None else [self._nearest(values) for values in earlier.values]
+        if earlier is not None and earlier.is_settled:
             # So few simulations leave the local search nothing but its last descent.
-            population, generations, chromosome = 2, 1, self._nearest(begin)
+            population, generations, chromosome = 2, 1, begun[0]
         search = GeneticSearch(
             self.space_, preset, population, generations, rng, *rule, begin=chromosome
         )
-        return SearchRun(objective, search, self.generations, self.criterion_ != "error")
+        return SearchRun(objective, search, self.generations, self.criterion_ != "error", begun)
 
     def _nearest(self, values: Mapping[str, float]) -> FloatArray:
         """The chromosome (n_free,) in the ranges nearest to values by name, else the nominal."""

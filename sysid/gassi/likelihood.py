@@ -9,11 +9,13 @@ likelihood chooses once more, each output counted by as many independent samples
 its errors leaves; those that it cannot tell apart are rivals.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from sysid.fitting.free_run import accurate, fine_enough, noiseless
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
+from sysid.gassi.earlier_minima import EarlierMinima
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, by_filter, coloured
 from sysid.gassi.lookalikes import lookalikes
@@ -72,6 +75,33 @@ class Likeliest:
     ridge: tuple[FloatArray, ...]
 
 
+@dataclass(frozen=True)
+class Begun:
+    """Where a fit of some of the records has ended, as a fit of all of them begins there.
+
+    chromosomes: (n_free,) each, the best first. noise: (n_outputs,), by which a filter judged them.
+    is_settled: whether the first was told from all others.
+    """
+
+    chromosomes: Sequence[FloatArray] = ()
+    noise: FloatArray | None = None
+    is_settled: bool = False
+
+    @classmethod
+    def of(
+        cls, earlier: EarlierMinima | None, objective: Objective, chromosomes: Sequence[FloatArray]
+    ) -> Begun:
+        """Of minima the parameters alone, of each (n,), which the objective may be simulated at."""
+        if earlier is None:
+            return cls()
+        started = [objective.space.with_nominal_starts(each) for each in chromosomes]
+        kept = [each for each in started if np.isfinite(objective.rms(each[None])).all()]
+        outputs = objective.simulator.model.output_names
+        known = all(name in earlier.noise for name in outputs)
+        noise = np.array([earlier.noise[name] for name in outputs]) if known else None
+        return cls(kept, noise, earlier.is_settled)
+
+
 def fit_likelihood(
     objective: Objective,
     minima: Sequence[FloatArray],
@@ -79,21 +109,22 @@ def fit_likelihood(
     *,
     noise: NoisyInputs | None = None,
     process: FloatArray | None = None,
+    begun: Begun | None = None,
     explored: bool = False,
-    settled: bool = False,
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
     noise: how all of them are refitted in the end, where inputs or the process are noisy; by
-    innovations, too, where free runs would not do. process: as of ``Innovations``. explored:
-    whether the minima have their lookalikes among them. settled: whether there are none, to a
-    filter neither.
+    innovations, too, where free runs would not do. process: as of ``Innovations``. begun: where
+    descents begin as well; if it is settled nothing looks like the minima. explored: whether these
+    have their lookalikes among them.
     """
-    objective = accurate(objective, minima[0])
+    objective, begun = accurate(objective, minima[0]), begun or Begun()
     # A filter begins at the minima of free runs, and does not end there; what looks like a minimum
     # it tells itself.
     roughly = noise == "innovations"
-    lookalike = not (explored or settled or roughly)
+    lookalike = not (explored or begun.is_settled or roughly)
+    minima = minima if roughly else [*minima, *begun.chromosomes]
     optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=roughly)
     if not roughly:
         objective, optima = _in_noise(objective, optima, watch)
@@ -103,7 +134,7 @@ def fit_likelihood(
         for corrects in (False, True) if noise == "compensated" else (True,):
             fit = partial(noisy_fit, corrects, process, objective)
             ranked = [best, *others]
-            refitted = refitted or _refitted(fit, objective, ranked, optima, watch, settled=settled)
+            refitted = refitted or _refitted(fit, objective, ranked, optima, begun, watch)
     if refitted is not None:
         optima = refitted
         best, *others = optima.ranked()
@@ -223,9 +254,8 @@ def _refitted(
     objective: Objective,
     ranked: Sequence[Optimum],
     by_error: Optima,
+    begun: Begun,
     watch: Watch | None,
-    *,
-    settled: bool,
 ) -> Optima | None:
     """The best optimum and those not told from it by the error, refitted for noisy inputs.
 
@@ -233,14 +263,18 @@ def _refitted(
     are refitted, and compared, at the noise of the first, and the best of them by its own. A
     filter tells minima apart that free runs do not, and others look like its own. Free runs may
     lead it to a poor one, whose noise is too large to compare by: from one that is far better all
-    begins anew at its noise. settled: whether nothing looks like the first.
+    begins anew at its noise. begun: as of ``fit_likelihood``.
     """
-    first = fit(ranked[0], watch)
+    goes_on = begun.is_settled and len(begun.chromosomes) > 0
+    first = _beside(fit, ranked[0], begun, watch) if goes_on else fit(ranked[0], watch)
     if first is None:
         return None
     likely = [o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE]
     starts = [optimum.chromosome for optimum in likely]
     filters = isinstance(first.objective, Innovations) and first.objective.corrects
+    if filters and begun.chromosomes and not goes_on:
+        first, more = _from_begun(fit, first, begun, ranked[0], watch)
+        starts += more
     if filters:
         first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
     too_well = _too_well(ranked[0].rms)
@@ -249,7 +283,7 @@ def _refitted(
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break
         explored = best
-        explores = filters and not settled
+        explores = filters and not begun.is_settled
         starts += lookalikes(first.objective, best.chromosome) if explores else []
         exact = _exact_among(first, starts) if filters else None
         if exact is not None:
@@ -410,6 +444,32 @@ def better_by_filter(
     return anew, rest
 
 
+def _beside(
+    fit: Callable[..., Optimum | None], by_error: Optimum, begun: Begun, watch: Watch | None
+) -> Optimum | None:
+    """The minimum beside that of an earlier fit, by the weights of one of the error.
+
+    The earlier noise tells the right minimum from afar: what innovations of new records show at the
+    earlier one may be far more.
+    """
+    return fit(replace(by_error, chromosome=begun.chromosomes[0]), watch, begun.noise)
+
+
+def _from_begun(
+    fit: Callable[..., Optimum | None],
+    first: Optimum,
+    begun: Begun,
+    by_error: Optimum,
+    watch: Watch | None,
+) -> tuple[Optimum, list[FloatArray]]:
+    """The better of a filter's minimum and one beside that of an earlier fit, and other starts."""
+    anew, rivals = _beside(fit, by_error, begun, watch), begun.chromosomes[1:]
+    if anew is None:
+        return first, [*rivals]
+    better, worse = (anew, first) if _foresees_more(anew, first) else (first, anew)
+    return better, [worse.chromosome, *rivals]
+
+
 def _foresees_more(optimum: Optimum, rival: Optimum) -> bool:
     """Whether its innovations are the less, by the lesser noise of both filters."""
     fitted, before = optimum.objective, rival.objective
@@ -428,13 +488,21 @@ def noisy_fit(
     objective: Objective,
     optimum: Optimum,
     watch: Watch | None = None,
+    noise: FloatArray | None = None,
 ) -> Optimum | None:
     """The minimum for noise from one of the error: weights, noise of outputs, parameters in turn.
 
-    corrects, process: as of ``Innovations``. None as of ``_refitted``.
+    corrects, process: as of ``Innovations``. noise: (n_outputs,), by which it is descended from
+    first, where what is seen at the optimum would be too much. None as of ``_refitted``.
     """
     chromosome, rms = optimum.chromosome, optimum.rms
-    fitted = Innovations.starting(optimum.objective, chromosome, corrects=corrects, process=process)
+    settings: dict[str, Any] = {"corrects": corrects, "process": process}
+    if noise is not None:
+        known = Innovations.of(optimum.objective, noise, near=chromosome, **settings)
+        weights = objective.weights * np.mean(known.scales, axis=0) / known.noise
+        known = known.eased(chromosome).weighed(weights)
+        chromosome = refine(known, chromosome, on_iteration=watch).chromosome
+    fitted = Innovations.starting(optimum.objective, chromosome, **settings)
     last = np.zeros(len(fitted.noise))
     too_well = _too_well(rms)
     for _ in range(_NOISE_ROUNDS):

@@ -1,6 +1,6 @@
 """A whole search, step by step: genetic search, then local refinement."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -33,7 +33,8 @@ class Best(NamedTuple):
 class SearchRun:
     """A genetic search and the local search that follows it.
 
-    likelihood: whether simulations are kept for telling minima apart by their likelihood.
+    likelihood: whether simulations are kept for telling minima apart by their likelihood. begun:
+    chromosomes, (n_free,) each, that descents start from before those of the genetic search.
     history: the best error after each generation, of as many simulations as the population has
     chromosomes; the last with what exceeded the budget. flagged: failures of the genetic search.
     """
@@ -42,6 +43,7 @@ class SearchRun:
     search: GeneticSearch
     generations: int
     likelihood: bool
+    begun: Sequence[FloatArray] = ()
     local: LocalSearch | None = None
     history: list[float] = field(default_factory=list)
     flagged: dict[str, int] = field(default_factory=dict)
@@ -141,5 +143,5 @@ class SearchRun:
         if self.likelihood:
             kept = _MOST_RIVALS * _ITERATIONS_EACH * simulations_per_iteration(self.objective)
             budget -= min(kept, budget // 4)
-        starts = space.with_nominal_starts(search.promising(AT_ONCE))
+        starts = space.with_nominal_starts(np.array([*self.begun, *search.promising(AT_ONCE)]))
         return LocalSearch(self.objective, starts, budget, search.population, search.rng)

@@ -102,10 +102,10 @@ def test_a_later_round_begins_where_the_last_one_left_no_quantity_without_an_end
         content["parameters"]["K_m"]["interval"] = ends
         file.write_text(yaml.safe_dump(content))
         earlier = first.as_earlier_fit
-        assert (earlier is not None) == goes_on
-        if earlier is not None:
-            assert ("K_m" in earlier.intervals) == (None not in ends)
-            assert earlier.values["K_m"] == content["parameters"]["K_m"]["value"]
+        assert earlier.minima.is_settled == goes_on
+        assert ("K_m" in earlier.intervals) == (ends is not None and None not in ends)
+        assert earlier.minima.values[0]["K_m"] == content["parameters"]["K_m"]["value"]
+        assert earlier.minima.noise.keys() == set(content["criterion"].get("noise", ()))
 
 
 def test_each_run_has_noise_of_its_own(finished):
