@@ -29,7 +29,7 @@ from sysid.arrays import FloatArray
 from sysid.experiments import rivals
 from sysid.experiments.experiment import deviations_of
 from sysid.experiments.information import Informant
-from sysid.experiments.rivals import Answer, Hypothesis
+from sysid.experiments.rivals import Answer, Hypothesis, nested
 from sysid.threads import Workers, available_cores, one_thread
 
 RATE, RUN = 800.0, 1.25  # Hz, s
@@ -118,15 +118,15 @@ def separated(
             continue
         # From what a wide search would come to as well: the truth, and any other point.
         tasks += [
-            (i, j, answers, hidden if i == j else drawn(each.space, rng))
+            (i, j, answers, drawn(each.space, rng), nested(each, truth.space.names, hidden))
             for j, each in enumerate(hypotheses)
         ]
     scores: dict[tuple[int, int], float] = {}
 
-    def fit(task: tuple[int, int, list[Answer], FloatArray]) -> None:
-        i, j, answers, start = task
+    def fit(task: tuple[int, int, list[Answer], FloatArray, FloatArray]) -> None:
+        i, j, answers, *starts = task
         rival, left = hypotheses[j], []
-        for begin in (rival.values, start):
+        for begin in (rival.values, *starts):
             end = rivals.refit(answers, rival, begin)
             joints = [rivals.contrast(each, rival, end).joint for each in answers]
             left.append(sum(joint[-1, -1] for joint in joints))

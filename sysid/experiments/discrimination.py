@@ -110,7 +110,8 @@ def discriminate(
     candidates, generations, offspring, watch: as of ``design``; limits must hold whichever
     structure is right. spaces, priors: by the same names, what is searched and what is known; by
     default the models' ranges around their nominal values. benches: by the same names, what a run
-    would log if that structure were right. starts: points from which each rival is fitted.
+    would log if that structure were right. starts: points from which each rival is
+    fitted: where it is likeliest, where it is nearest to the truth, and others anywhere.
 
     Raises ModelError for unknown names, models whose inputs or outputs differ, equations that
     cannot be differentiated, where every candidate would pass a limit, and where no run tells any
@@ -158,7 +159,7 @@ def discriminate(
 
     search = Search(excitations, evaluate, tournament.criterion(), rng, runs, workers, watch)
     search.scatter(candidates)
-    begins = [tournament.likeliest(), *(tournament.drawn() for _ in range(starts - 1))]
+    begins = tournament.begins(tournament.likeliest(), starts)
     tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins)[0])
     search.revise(tournament.judged)
     tournament.judge_possible(search.pool, runs)
@@ -177,7 +178,7 @@ def discriminate(
         tournament.points.append(point)
         search.revise(tournament.judged)
     answers = _answers(best[1])
-    begins = [best[2], *(tournament.drawn() for _ in range(starts - 1))]
+    begins = tournament.begins(best[2], starts)
     sharp = tournament.sharper(_SHARPER * accuracy)
     logged = [sharp.answers([a.record for a in run]) for run in answers]
     end = sharp.refit(logged, [tournament.refit(answers, begins)[0]])

@@ -52,6 +52,18 @@ class Hypothesis:
     ridge: FloatArray
 
 
+def nested(rival: Hypothesis, names: Sequence[str], values: FloatArray) -> FloatArray:
+    """A rival's chromosome (n_free,) at another structure's values of what both have.
+
+    names, values: (n,), of the other's parameters. What the rival has beside is as little as may
+    be: a structure that holds the other as a special case is next to it there.
+    """
+    space, shared = rival.space, dict(zip(names, values, strict=True))
+    wanted = [shared.get(name, 0.0) for name in space.names]
+    chromosome: FloatArray = np.clip(wanted, space.lower, space.upper)
+    return chromosome if space.feasible(chromosome) else rival.values
+
+
 @dataclass(frozen=True)
 class Answer:
     """What a run would log if a structure were right.

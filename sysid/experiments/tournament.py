@@ -135,7 +135,17 @@ class Tournament:
         """All rivals at their likeliest values."""
         return [self.structures[j].values for _, j in self.pairs]
 
-    def drawn(self) -> Point:
+    def begins(self, first: Point, count: int) -> list[Point]:
+        """Points that rivals are refitted from, as many: a first, near the truths, and anywhere."""
+        anywhere = (self._drawn() for _ in range(count - 2))
+        return [first, self._nested(), *anywhere][:count]
+
+    def _nested(self) -> Point:
+        """All rivals at the truths' values, as far as they have the same parameters."""
+        pairs = [(self.structures[i], self.structures[j]) for i, j in self.pairs]
+        return [rivals.nested(rival, truth.space.names, truth.values) for truth, rival in pairs]
+
+    def _drawn(self) -> Point:
         """All rivals anywhere in their ranges."""
         return [self._anywhere(self.structures[j]) for _, j in self.pairs]
 

@@ -231,3 +231,18 @@ def test_the_power_of_the_test_is_how_often_it_refuses_the_rival():
 def test_mistakes_are_named(models, options, named):
     with pytest.raises(ModelError, match=named):
         discriminate(models, [waves()], **{**QUICK, **options})
+
+
+def test_a_rival_that_holds_the_truth_is_fitted_from_the_truth():
+    frequency = ("w", 12.0, 1.0, 400.0)
+    plain = spring("plain", lambda u, p: np.sin(p[0] * u), frequency)
+    more = spring(
+        "more",
+        lambda u, p: np.sin(p[0] * u) + p[1] * u * u,
+        ("w", 3.3, 1.0, 400.0),  # where a descent ends in a minimum of its own
+        ("q", 0.3, -1.0, 1.0),
+    )
+    contests = discriminate({"plain": plain, "more": more}, [waves()], runs=2, **QUICK).contests
+    (contest,) = (c for c in contests if c.truth == "plain")
+    assert contest.distance < 0.1
+    assert contest.values["w"] == pytest.approx(12.0, rel=1e-3)
