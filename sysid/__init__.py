@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from sysid.judging.comparison import Candidate, Comparison, compare
     from sysid.linear import ARMAX, ARX, OE, select_orders
     from sysid.problem.data import Dataset, output_scale
+    from sysid.problem.earlier_minima import EarlierMinima
     from sysid.problem.given import Given
     from sysid.problem.guesses import Guess, guess_ranges, regression
     from sysid.problem.metrics import Metrics, evaluate, fit_percent, msd, rmse
@@ -61,6 +62,7 @@ __all__ = [
     "Dataset",
     "Design",
     "Discrimination",
+    "EarlierMinima",
     "Excitation",
     "Given",
     "Guess",
@@ -122,6 +124,7 @@ _NAMES = {
     "sysid.judging.comparison": "Candidate Comparison compare",
     "sysid.linear": "ARMAX ARX OE select_orders",
     "sysid.problem.data": "Dataset output_scale",
+    "sysid.problem.earlier_minima": "EarlierMinima",
     "sysid.problem.given": "Given",
     "sysid.problem.guesses": "Guess guess_ranges regression",
     "sysid.problem.metrics": "Metrics evaluate fit_percent msd rmse",

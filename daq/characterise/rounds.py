@@ -20,7 +20,7 @@ from daq.files import make_folder, write_whole
 from daq.identification.earlier_fit import EarlierFit
 from daq.identification.request import PARAMETERS
 from daq.logs.capture import COMPLETED, INTERLOCK, RUN_NAME
-from sysid.gassi import EarlierMinima
+from sysid import EarlierMinima
 
 _REQUEST = "characterise.json"
 _RUNS, _IDENTIFICATION = "runs", "identification"

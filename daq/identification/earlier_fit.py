@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sysid.gassi import EarlierMinima
+from sysid import EarlierMinima
 from sysid.judging.assessment import coloured_innovations
 
 if TYPE_CHECKING:

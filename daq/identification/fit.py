@@ -26,7 +26,7 @@ from daq.logs.capture import LOG_NAME
 from daq.logs.recording import Recording, log_path
 from daq.lookup.models import trust_option
 from daq.progress import Note, Progress, Watch, ignore, warn
-from sysid import ModelError, ProcessModel, SearchSpace
+from sysid import EarlierMinima, ModelError, ProcessModel, SearchSpace
 from sysid.judging.lags import lag_faults
 from sysid.judging.plausibility import implausible, start_faults
 from sysid.problem.copies import shared_samples
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from daq.identification.draft import Draft, Missing
     from daq.identification.earlier_fit import EarlierFit
-    from sysid.gassi import GASSI, EarlierMinima
+    from sysid.gassi import GASSI
     from sysid.gassi import Progress as SearchProgress
     from sysid.uncertainty import Uncertainty
 

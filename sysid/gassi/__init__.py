@@ -1,7 +1,6 @@
 """Genetic algorithm for stable system identification (GASSI) and its relatives."""
 
-from sysid.gassi.earlier_minima import EarlierMinima
 from sysid.gassi.estimator import GASSI, Progress
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 
-__all__ = ["GASSI", "PRESETS", "EarlierMinima", "GeneticSearch", "Preset", "PresetName", "Progress"]
+__all__ = ["GASSI", "PRESETS", "GeneticSearch", "Preset", "PresetName", "Progress"]

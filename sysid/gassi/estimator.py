@@ -20,7 +20,6 @@ from sysid.fitting.objective import Balance, Objective
 from sysid.fitting.refinement import begin, refine_each
 from sysid.gassi.cega_objective import CegaObjective
 from sysid.gassi.checkpoint import Checkpoint, load, origin
-from sysid.gassi.earlier_minima import EarlierMinima
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.first_samples import noticed_starts, with_starts
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
@@ -28,6 +27,7 @@ from sysid.gassi.likelihood import Begun, NoisyInputs, fit_likelihood, promising
 from sysid.gassi.nudged import nudged
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
+from sysid.problem.earlier_minima import EarlierMinima
 from sysid.problem.given import Given
 from sysid.problem.guesses import Guess, guess_ranges
 from sysid.problem.metrics import fit_percent

@@ -25,7 +25,6 @@ from sysid.fitting.free_run import accurate, fine_enough, noiseless
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
-from sysid.gassi.earlier_minima import EarlierMinima
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, by_filter, coloured
 from sysid.gassi.lookalikes import lookalikes
@@ -41,6 +40,7 @@ from sysid.gassi.optima import (
     to_compare,
 )
 from sysid.gassi.slide import slid
+from sysid.problem.earlier_minima import EarlierMinima
 from sysid.uncertainty.estimate import Z95
 
 _ROUNDS = 6  # of weights and parameters in turn

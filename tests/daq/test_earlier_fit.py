@@ -8,7 +8,7 @@ from daq.identification.fit import fit
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.progress import Note
-from sysid.gassi import EarlierMinima
+from sysid import EarlierMinima
 from tests.daq.support import few_free, write_experiment, write_yaml
 
 ANEW = "the logs together want other parameters than before: a search begins"

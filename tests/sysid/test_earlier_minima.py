@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sysid import GASSI, Dataset, Input, Output, Parameter, ProcessModel, State
-from sysid.gassi import EarlierMinima
+from sysid import (
+    GASSI,
+    Dataset,
+    EarlierMinima,
+    Input,
+    Output,
+    Parameter,
+    ProcessModel,
+    State,
+)
 
 DT, NOISE, WIDTH = 0.01, 0.01, 0.015
 TRUTH = {"first": 0.62, "second": 0.37, "tau": 0.05}
