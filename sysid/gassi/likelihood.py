@@ -97,8 +97,9 @@ class Begun:
         started = [objective.space.with_nominal_starts(each) for each in chromosomes]
         kept = [each for each in started if np.isfinite(objective.rms(each[None])).all()]
         outputs = objective.simulator.model.output_names
-        known = all(name in earlier.noise for name in outputs)
-        noise = np.array([earlier.noise[name] for name in outputs]) if known else None
+        noise = None
+        if all(name in earlier.noise for name in outputs):
+            noise = np.array([earlier.noise[name] for name in outputs])
         return cls(kept, noise, earlier.is_settled)
 
 
@@ -265,14 +266,15 @@ def _refitted(
     lead it to a poor one, whose noise is too large to compare by: from one that is far better all
     begins anew at its noise. begun: as of ``fit_likelihood``.
     """
-    goes_on = begun.is_settled and len(begun.chromosomes) > 0
+    # Without its noise a filter is not begun better there than where free runs lead.
+    goes_on = begun.is_settled and begun.noise is not None and len(begun.chromosomes) > 0
     first = _beside(fit, ranked[0], begun, watch) if goes_on else fit(ranked[0], watch)
     if first is None:
         return None
     likely = [o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE]
     starts = [optimum.chromosome for optimum in likely]
     filters = isinstance(first.objective, Innovations) and first.objective.corrects
-    if filters and begun.chromosomes and not goes_on:
+    if filters and begun.chromosomes and not begun.is_settled:
         first, more = _from_begun(fit, first, begun, ranked[0], watch)
         starts += more
     if filters:
@@ -498,10 +500,10 @@ def noisy_fit(
     chromosome, rms = optimum.chromosome, optimum.rms
     settings: dict[str, Any] = {"corrects": corrects, "process": process}
     if noise is not None:
-        known = Innovations.of(optimum.objective, noise, near=chromosome, **settings)
-        weights = objective.weights * np.mean(known.scales, axis=0) / known.noise
-        known = known.eased(chromosome).weighed(weights)
-        chromosome = refine(known, chromosome, on_iteration=watch).chromosome
+        assumed = Innovations.of(optimum.objective, noise, near=chromosome, **settings)
+        weights = objective.weights * np.mean(assumed.scales, axis=0) / assumed.noise
+        assumed = assumed.eased(chromosome).weighed(weights)
+        chromosome = refine(assumed, chromosome, on_iteration=watch).chromosome
     fitted = Innovations.starting(optimum.objective, chromosome, **settings)
     last = np.zeros(len(fitted.noise))
     too_well = _too_well(rms)

@@ -44,7 +44,8 @@ def identified(case, values=None, ends=None, *, settled=True):
     problem, logs, _ = case
     earlier = None
     if values is not None:
-        earlier = EarlierFit(EarlierMinima([values], is_settled=settled), ends)
+        noise = case[2].document["criterion"]["noise"]
+        earlier = EarlierFit(EarlierMinima([values], noise, settled), ends)
     said = []
     result = fit(
         problem, logs, [], None, said.append, examine=lambda result: False, earlier=earlier
