@@ -288,7 +288,11 @@ class Identification(Shown):
             "model": self.problem.model_name,
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
-            "criterion": _criterion(self),
+            "criterion": {
+                "name": estimator.criterion_,
+                "reason": estimator.criterion_reason_,
+                **({"noise": noise} if (noise := filter_noise(estimator)) else {}),
+            },
             **({"averaged": averaged} if (averaged := _averaged(self)) else {}),
             **({"preparation": prepared} if (prepared := _preparation(self)) else {}),
             "verdict": _verdict(verdict),
@@ -566,14 +570,12 @@ def _in_parts_of_noise(result: RecordResult, j: int) -> dict[str, float]:
     return {f"residual_to_noise_{key}": float(f"{value:.4g}") for key, value in figures.items()}
 
 
-def _criterion(result: Identification) -> dict[str, Any]:
-    """What the fit ended with, and the outputs' noise by which a filter did, in their units."""
-    estimator = result.estimator
-    criterion = {"name": estimator.criterion_, "reason": estimator.criterion_reason_}
-    if estimator.criterion_ != "innovations" or estimator.output_noise_ is None:
-        return criterion
-    noise = map(float, estimator.output_noise_)
-    return {**criterion, "noise": dict(zip(result.model.output_names, noise, strict=True))}
+def filter_noise(estimator: GASSI) -> dict[str, float]:
+    """Noise of the outputs by which a filter judged a fit, in their units; empty without one."""
+    noise = estimator.output_noise_
+    if estimator.criterion_ != "innovations" or noise is None:
+        return {}
+    return dict(zip(estimator.simulator().model.output_names, map(float, noise), strict=True))
 
 
 def _averaged(result: Identification) -> dict[str, str]:

@@ -1,5 +1,7 @@
 """An identification that has the logs of an earlier one and more begins where that one ended."""
 
+from dataclasses import replace
+
 import pytest
 
 from daq import record
@@ -73,6 +75,17 @@ def test_a_start_that_all_logs_speak_against_leads_to_a_search(case):
     for name, (low, high) in of(searched)[1].items():
         value = of(searched)[0][name]
         assert of(begun)[0][name] == pytest.approx(value, abs=0.1 * (high - low))
+
+
+def test_logs_at_odds_or_noisier_than_before_speak_against_a_start(case):
+    values, ends = of(case[2])
+    result, noise = case[2], case[2].document["criterion"]["noise"]
+    earlier = EarlierFit(EarlierMinima([values], noise), ends)
+    assert earlier.agrees(result)
+    assert earlier.explains(values, noise)
+    assert not earlier.explains(values, {**noise, "omega": 3.0 * noise["omega"]})
+    at_odds = replace(result, uncertainty=replace(result.uncertainty, disagreement=5.0))
+    assert not earlier.agrees(at_odds)
 
 
 def test_an_earlier_fit_that_left_something_open_is_among_the_starts_of_a_search(case):
