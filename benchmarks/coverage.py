@@ -1,15 +1,16 @@
 """Do the intervals cover the truth, and does a noise-free record give the true parameters?
 
 python -m benchmarks.coverage [--json] [--seeds 200] [--exact 20] [--experiment prbs.yaml ...]
-                              [--jobs N] [--dask ADDRESS]
+                              [--verdicts] [--jobs N] [--dask ADDRESS]
 
 Noise: shipped experiments on the simulated rig, a new seed of noise, offsets and search each time,
 identified from the shipped ranges; every quantity that gets an interval is asked whether it holds
 the truth. Strong quantities have an interval by the curvature, weak ones one by the profile
 likelihood, perhaps with one end. The bars: of each strong one 93 to 97 % hold and the mean error
-is below 0.3 standard deviations, of each weak one 90 to 99 %. Noise-free: the model's own outputs,
-identified with another seed of the search each time; every determined quantity is compared with
-the truth. Ctrl-C ends an experiment with the seeds that are done.
+is below 0.3 standard deviations, of each weak one 90 to 99 %. --verdicts: and how many are called
+good, as of a right model 95 % should be, and why the others are not. Noise-free: the model's own
+outputs, identified with another seed of the search each time; every determined quantity is compared
+with the truth. Ctrl-C ends an experiment with the seeds that are done.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from sim_rig.actuator import actuator
 from sysid import BatchSimulator, Dataset
 from sysid.arrays import FloatArray
 from sysid.gassi import GASSI
+from sysid.judging.examination import verdict_of
 from sysid.problem.model import ProcessModel
 from sysid.uncertainty import Estimate
 from sysid.uncertainty.estimate import Z95
@@ -41,6 +43,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=200, help="of noise")
     parser.add_argument("--exact", type=int, default=20, help="seeds of the search without noise")
     parser.add_argument("--experiment", nargs="+", default=_EXPERIMENTS, help="shipped ones")
+    parser.add_argument("--verdicts", action="store_true", help="how many are called good, too")
     spreading(parser)
     options = parser.parse_args()
     figures = {
@@ -61,13 +64,17 @@ class _Held:
 
 @dataclass(frozen=True)
 class _Seed:
-    """What became of one seed's intervals. joint: the share that is stated to hold at once."""
+    """What became of one seed's intervals. joint: the share that is stated to hold at once.
+
+    doubts: why not all is called good; None where that was not asked.
+    """
 
     seed: int
     seconds: float
     answers: int
     joint: float | None
     intervals: tuple[_Held, ...]
+    doubts: tuple[str, ...] | None = None
 
     @property
     def missed(self) -> list[str]:
@@ -78,7 +85,12 @@ class _Seed:
 def coverage(experiment: str, options: argparse.Namespace) -> dict[str, Any]:
     """Share of the 95 % intervals that hold the truth, for each quantity and together."""
     seeds: list[_Seed] = spread(
-        functools.partial(_intervals, experiment, threads=1 if options.jobs != 1 else None),
+        functools.partial(
+            _intervals,
+            experiment,
+            threads=1 if options.jobs != 1 else None,
+            verdicts=options.verdicts,
+        ),
         range(options.seeds),
         options,
         lambda seed: f"{len(seed.intervals)} intervals, missed: {', '.join(seed.missed) or 'none'}",
@@ -94,24 +106,31 @@ def coverage(experiment: str, options: argparse.Namespace) -> dict[str, Any]:
         "joint_coverage": _mean([not seed.missed for seed in seeds]),
         "joint_coverage_stated": _mean([s.joint for s in seeds if s.joint is not None]),
         "several_answers": _mean([seed.answers > 1 for seed in seeds]),
+        "good": _mean([not seed.doubts for seed in seeds if seed.doubts is not None]),
+        "doubts": {seed.seed: seed.doubts for seed in seeds if seed.doubts},
         "processor_seconds_each": _mean([seed.seconds for seed in seeds]),
         "quantities": {name: _figures(intervals) for name, intervals in quantities.items()},
     }
 
 
-def _intervals(experiment: str, seed: int, *, threads: int | None) -> _Seed:
+def _intervals(experiment: str, seed: int, *, threads: int | None, verdicts: bool) -> _Seed:
     """The intervals from one run of a shipped experiment, beside the truth."""
     plant = rig_of(experiment)[1].options.plant
     load = "measured" if plant.sensor == "load" else plant.load
     model, truth = actuator(load=load, sensor=plant.sensor), _truth(plant.process_model())
-    training, _ = simulated_logs(model, seed, experiment)
+    training, validation = simulated_logs(model, seed, experiment)
     begin = time.process_time()
     fitted = GASSI(model, random_state=seed, threads=threads).fit(training)
     uncertainty = fitted.uncertainty(training)
     seconds = time.process_time() - begin
     estimates = [e for e in uncertainty.determined() if "(0)" not in e.name]
     held = tuple(_held(estimate, estimate.at(truth)) for estimate in estimates)
-    return _Seed(seed, seconds, 1 + len(uncertainty.rivals), uncertainty.joint, held)
+    doubts = None
+    if verdicts:
+        others = [] if validation is training else [validation]
+        verdict = verdict_of(fitted, [training], others, uncertainty)
+        doubts = () if verdict.trust == "good" else verdict.reasons
+    return _Seed(seed, seconds, 1 + len(uncertainty.rivals), uncertainty.joint, held, doubts)
 
 
 def _held(estimate: Estimate, truth: float) -> _Held:
@@ -200,6 +219,10 @@ def show(figures: dict[str, Any]) -> None:
             f"{strong} of the strong and {weak} of the weak intervals hold the truth, all at "
             f"once {together} (stated: {stated}); several answers in {several}"
         )
+        if noisy["good"] is not None:
+            print(f"  {_percent(noisy['good'])} are called good")
+        for seed, reasons in noisy["doubts"].items():
+            print(f"  seed {seed}: {' '.join(reasons)}")
         for seed, names in noisy["missed"].items():
             print(f"  seed {seed} misses {', '.join(names)}")
         for name, row in noisy["quantities"].items():

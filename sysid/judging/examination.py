@@ -34,9 +34,14 @@ class Suspicion:
 
 
 def verdict_of(
-    estimator: GASSI, training: Sequence[Dataset], validation: Sequence[Dataset] = ()
+    estimator: GASSI,
+    training: Sequence[Dataset],
+    validation: Sequence[Dataset] = (),
+    uncertainty: Uncertainty | None = None,
 ) -> Verdict:
     """The verdict on a fitted estimator: all that is tested, in one call.
+
+    uncertainty: the estimator's, by the training, where it is at hand.
 
     >>> from sysid.examples import lag, lag_record
     >>> logs = lag_record(seed=1), lag_record(seed=2)
@@ -45,7 +50,8 @@ def verdict_of(
     'good'
     """
     refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
-    uncertainty = estimator.uncertainty(list(training)) if refined else None
+    if refined and uncertainty is None:
+        uncertainty = estimator.uncertainty(list(training))
     trained, validated = (
         [examined(estimator, record, uncertainty)[1] for record in part]
         for part in (training, validation)
