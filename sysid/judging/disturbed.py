@@ -16,6 +16,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.engine.stepper import Stepper
 from sysid.engine.trace import rates_along
+from sysid.engine.windows import average, with_integrals
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ModelError, ProcessModel
 from sysid.threads import Workers
@@ -69,8 +70,9 @@ class DisturbedRun:
     """A free run of a record under parameters (n_parameters,), and what disturbances change.
 
     start: (n_states,), where it begins. states: (n_samples, n_states) and outputs: (n_samples,
-    n_outputs) of the undisturbed run. rates: (n_samples, n_states), its f(x, u, p). workers: that
-    runs share, to be disturbed side by side. Raises ModelError where the run does not stay finite.
+    n_outputs) of the undisturbed run, these over the record's windows. rates: (n_samples,
+    n_states), its f(x, u, p). workers: that runs share, to be disturbed side by side. Raises
+    ModelError where the run does not stay finite.
     """
 
     model: ProcessModel
@@ -80,7 +82,12 @@ class DisturbedRun:
     workers: Workers = field(default_factory=lambda: Workers(1))
 
     def __post_init__(self) -> None:
-        whole = with_added_inputs(self.model)
+        windows, whole = self.record.windows, with_added_inputs(self.model)
+        self._averaged: list[int] = []
+        if windows.size:
+            self._averaged = np.flatnonzero(windows.any(axis=(0, 2))).tolist()
+            whole = with_integrals(whole, self._averaged) if self._averaged else whole
+        places = [whole.output_names.index(name) for name in self.model.state_names]
         scale = np.maximum(np.abs(self.start), 1e-3)
         # A first run tells the states' magnitudes, by which accuracy is measured.
         for _ in range(2):
@@ -89,19 +96,23 @@ class DisturbedRun:
                 self.vector,
                 self.record.dt,
                 n_steps=_BASE_STEPS,
-                scale=scale,
+                scale=np.append(scale, np.full(len(self._averaged), np.inf)),
                 accuracy=_ACCURACY,
             )
-            self._whole_run = self._advance(self.record.inputs, 0.0)
-            places = [whole.output_names.index(name) for name in self.model.state_names]
-            self.states = self._whole_run[:, places]
-            if not np.all(np.isfinite(self._whole_run)):
+            whole_run = self._advance(self.record.inputs, 0.0)
+            if not np.all(np.isfinite(whole_run)):
                 raise ModelError(f"model {self.model.name}: its run on {self.record.name} fails")
+            self.states = whole_run[:, places]
             largest = np.abs(self.states).max(axis=0)
             scale = np.where(largest > 0.0, largest, 1.0)
-        self.outputs = self._whole_run[:, : len(self.model.outputs)]
+        self._whole_run = whole_run
+        self.outputs = self._as_measured(whole_run)
         self.rates = self.rates_of(self.model.derivative, self.vector)
         self._rate_size = np.sqrt(np.mean(self.rates**2, axis=0))
+
+    def over(self, windows: FloatArray) -> FloatArray:
+        """The undisturbed outputs over other windows, (n_samples, n_outputs, 2)."""
+        return self._as_measured(self._whole_run, windows)
 
     def rates_of(self, derivative: Callable[..., Any], vector: FloatArray) -> FloatArray:
         """Values of another derivative along the run, (n_samples, n_states), NaN where it fails."""
@@ -132,12 +143,12 @@ class DisturbedRun:
         """Change of the outputs per unit of where a state starts, (n_samples, n_outputs)."""
         start, eps = self.start.copy(), _SMALL * float(np.abs(self.states[:, place]).max() or 1.0)
         start[place] += eps
-        moved = self._advance(self.record.inputs, 0.0, start)[:, : self.outputs.shape[1]]
+        moved = self._as_measured(self._advance(self.record.inputs, 0.0, start))
         change: FloatArray = (moved - self.outputs) / eps
         return change if np.all(np.isfinite(change)) else np.zeros_like(self.outputs)
 
     def _change(self, inputs: FloatArray, rates: FloatArray | float, eps: float) -> FloatArray:
-        disturbed = self._advance(inputs, rates)[:, : self.outputs.shape[1]]
+        disturbed = self._as_measured(self._advance(inputs, rates))
         change: FloatArray = (disturbed - self.outputs) / eps
         return change if np.all(np.isfinite(change)) else np.zeros_like(self.outputs)
 
@@ -149,9 +160,19 @@ class DisturbedRun:
         signals = np.hstack([inputs, added])
         # Outputs stand at the start of every interval: the last row begins one that goes nowhere.
         signals = np.vstack([signals, signals[-1:]])
-        return self._stepper.advance(
-            (self.start if start is None else start).copy(), np.ascontiguousarray(signals)
-        )[1]
+        begin = self.start if start is None else start
+        integrals = np.zeros(len(self._averaged))
+        return self._stepper.advance(np.append(begin, integrals), np.ascontiguousarray(signals))[1]
+
+    def _as_measured(self, whole_run: FloatArray, windows: FloatArray | None = None) -> FloatArray:
+        """The model's outputs, averaged ones over windows, the record's or others."""
+        windows = self.record.windows if windows is None else windows
+        outputs = whole_run[:, : len(self.model.outputs)].copy()
+        integrals = whole_run[:, whole_run.shape[1] - len(self._averaged) :] / self.record.dt
+        for j, integral in zip(self._averaged, integrals.T, strict=True):
+            within = windows[:, j] / self.record.dt
+            outputs[:, j] = average(outputs[:, [j]], integral[:, None], within)[:, 0]
+        return outputs
 
 
 def of_each(

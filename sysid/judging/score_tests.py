@@ -23,6 +23,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import noiseless
+from sysid.fitting.means import scatter
 from sysid.fitting.objective import Objective
 from sysid.judging.cycles import cycle_suspects
 from sysid.judging.disturbed import DisturbedRun, of_each
@@ -39,6 +40,7 @@ from sysid.judging.suspects import (
     in_single_records,
     likely_noise,
     variant_suspects,
+    with_play,
 )
 from sysid.judging.whitener import Whitener
 from sysid.problem.terms import AddedTerm
@@ -60,6 +62,10 @@ _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
 _LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
+_TINY = 1e-300
+_ITERATIONS = 20  # by which residuals' variances settle
+_COMMON = 0.15  # of the windows' jitter, that they may all lie too early or too late
+_NOISE_WIDTH = 3.0  # of an input's noise from low to high, in its deviations
 _INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
 _REACH = 10.0  # of a term's range in parts of the size that its test found
@@ -99,7 +105,9 @@ class ScoreTests:
         # Noise of an input makes its gain look smaller: that is no fault.
         channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
         foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
-        self._tests = _Tests(local, foreseen, _noisy_starts(runs, local), runs[0].workers)
+        foreseen = foreseen[..., foreseen.any(axis=(0, 1))]
+        chance = np.concatenate([_noisy_starts(runs, local), _moved_windows(runs)], axis=2)
+        self._tests = _Tests(local, foreseen, chance, _weights(runs, local), runs[0].workers)
         channels += in_single_records([s for s in channels if s.kind != "noise"], runs)
         self._named = [*channels, *variant_suspects(runs)]
 
@@ -138,13 +146,14 @@ def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
     """What the noise of inputs is likely to have done to the outputs, (n_rows, n_outputs, k).
 
     Given what was measured, noise is not zero in the mean: a Wiener filter tells what of an input
-    it probably is. Uncorrelated with any linear function of what was measured is only the rest.
+    it probably is. Uncorrelated with any linear function of what was measured is only the rest; of
+    levels that are held play takes the noise away as well, and better.
     """
     records = [run.record for run in runs]
     columns = []
     noisy = np.any([record.input_noise for record in records], axis=0)
     for i in np.flatnonzero(noisy).tolist():
-        columns.append(of_each(runs, partial(_likely_noise, i)))
+        columns += [of_each(runs, partial(part, i)) for part in (_likely_noise, _without_noise)]
     n = sum(record.n_samples for record in records)
     return np.stack(columns, axis=2) if columns else np.zeros((n, runs[0].outputs.shape[1], 0))
 
@@ -153,6 +162,13 @@ def _likely_noise(i: int, run: DisturbedRun) -> FloatArray:
     """What the noise of input i is likely to have done to the outputs, (n_samples, n_outputs)."""
     part = np.zeros(run.record.inputs.shape)
     part[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
+    return run.driven(part)
+
+
+def _without_noise(i: int, run: DisturbedRun) -> FloatArray:
+    """What play as wide as the noise of input i changes in the outputs."""
+    part = np.zeros(run.record.inputs.shape)
+    part[:, i] = with_play(run.record.inputs[:, i], _NOISE_WIDTH * float(run.record.input_noise[i]))
     return run.driven(part)
 
 
@@ -187,6 +203,46 @@ def _noisy_starts(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArra
     return np.concatenate(columns, axis=2)
 
 
+def _moved_windows(runs: Sequence[DisturbedRun]) -> FloatArray:
+    """Change (n_rows, n_outputs, 1) by what all windows may lie too early.
+
+    That each is known to within its jitter does not say that they are right in the mean.
+    """
+    if not any(run.record.jitter.any() for run in runs):
+        return np.zeros((sum(run.record.n_samples for run in runs), runs[0].outputs.shape[1], 0))
+
+    def later(run: DisturbedRun) -> FloatArray:
+        if not run.record.jitter.size:
+            return np.zeros_like(run.outputs)
+        return run.over(run.record.windows + _COMMON * run.record.jitter[..., None]) - run.outputs
+
+    return of_each(runs, later)[..., None]
+
+
+def _weights(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
+    """What each residual counts, (n_rows, n_outputs), by its deviation in parts of the smallest.
+
+    Of a mean over a time that is not well known the deviation is larger where the output changes
+    fast (``scatter``). As regressions weigh all alike, a few such means would decide.
+    """
+
+    def scattered(run: DisturbedRun) -> FloatArray:
+        return scatter(run.record, lambda record: run.over(record.windows))
+
+    pairs = zip(runs, local.objective.scales, strict=True)
+    scattering = np.concatenate([scattered(run) / scale**2 for run, scale in pairs])
+    if not scattering.any():
+        return np.ones(local.residual.shape)
+    squares = np.where(local.seen, local.residual**2, 0.0)
+    counts = np.maximum(local.seen.sum(axis=0), 1)
+    common = np.maximum(squares.sum(axis=0) / counts, _TINY)
+    for _ in range(_ITERATIONS):  # until squares are what variances say
+        share = np.sum(squares / (common + scattering), axis=0) / counts
+        common = np.maximum(common * share, _TINY)
+    weights: FloatArray = np.sqrt(common / (common + scattering))
+    return weights
+
+
 class _Tests:
     """Regression of residuals, to which suspects are admitted one after another.
 
@@ -199,23 +255,31 @@ class _Tests:
     _gradients: FloatArray
 
     def __init__(
-        self, local: Sensitivity, foreseen: FloatArray, chance: FloatArray, workers: Workers
+        self,
+        local: Sensitivity,
+        foreseen: FloatArray,
+        chance: FloatArray,
+        weights: FloatArray,
+        workers: Workers,
     ) -> None:
         """Of changes that are there whatever is missing, (n_residuals, n_outputs, k) each.
 
         foreseen: of any size. chance: by one standard deviation of what is known to be so large.
+        weights: (n_residuals, n_outputs), as of ``_weights``.
         """
         self._workers = workers
-        self._local, self._residual = local, -local.residual
+        self._local, self._residual = local, -local.residual * weights
         self._scales = np.concatenate(
             [
                 np.broadcast_to(scale, (n, len(scale)))
                 for scale, n in zip(local.objective.scales, local.lengths, strict=True)
             ]
         )
-        zeros = [zero[..., None] for zero in zero_errors(local)]
+        self._scales = self._scales / weights
+        zeros = [(zero * weights)[..., None] for zero in zero_errors(local)]
         foreseen, chance = (part / self._scales[..., None] for part in (foreseen, chance))
-        self._columns = np.concatenate([local.slopes, *zeros, chance, foreseen], axis=2)
+        slopes = local.slopes * weights[..., None]
+        self._columns = np.concatenate([slopes, *zeros, chance, foreseen], axis=2)
         on_bound = local.objective.space.on_bound(local.chromosome)
         freedom = np.where(on_bound, _UNBOUND, _FREEDOM)
         self._free = np.concatenate(
@@ -225,7 +289,9 @@ class _Tests:
                 np.zeros(foreseen.shape[2]),
             ]
         )
-        self._noises = list(input_noises(local))
+        self._noises = [
+            (rows, noise * weights[rows][..., None]) for rows, noise in input_noises(local)
+        ]
         self._regression = self._coloured_by(self._residual)
 
     def of(self, uncertainty: Uncertainty) -> Self:

@@ -429,3 +429,85 @@ def test_an_end_that_the_data_do_not_push_at_hides_nothing():
     damping = next(p for p in found.parameters if p.name == "B")
     assert damping.on_bound and not damping.pushed
     assert suspected(estimator, found, [training]) is not None
+
+
+LAG = ProcessModel(
+    name="lag",
+    states=(State("y", "V"),),
+    inputs=(Input("u", "V"),),
+    outputs=(Output("y", "V"),),
+    parameters=(
+        Parameter("tau", "s", 0.1, 0.005, 1.0, "log"),
+        Parameter("k", "1", 1.5, 0.1, 10.0, "log"),
+    ),
+    derivative=lambda x, u, p: ((p[1] * u[0] - x[0]) / p[0],),
+)
+
+
+def log_of_means(seed, windows, jitter=0.0, late=0.0, offset=0.0, noise=0.0, n=800, tau=0.05):
+    """Of a lag behind levels, in closed form: means over windows, (n, 2) in samples of 10 ms.
+
+    jitter: (n,) or one, deviation of when they truly were; late: by how much all came later; noise:
+    of the input. The numbers are the same for a seed.
+    """
+    rng, dt = np.random.default_rng(seed), 0.01
+    u = np.repeat(rng.uniform(-1.0, 1.0, n), rng.integers(5, 40, n))[:n]
+    y, fall = np.zeros(n + 1), np.exp(-dt / tau)
+    for k in range(n):
+        y[k + 1] = u[k] + (y[k] - u[k]) * fall
+    areas = np.append(0.0, np.cumsum(u + (y[:-1] - u) * tau / dt * (1.0 - fall)))
+
+    def area(time):
+        time = np.clip(time, 0.0, n - 1e-9)
+        k = np.floor(time).astype(int)
+        part = time - k
+        return areas[k] + u[k] * part + (y[k] - u[k]) * tau / dt * (1.0 - fall**part)
+
+    moved = np.arange(n) - late + jitter * rng.uniform(-1.0, 1.0, n) * np.sqrt(3.0)
+    begin, end = moved + windows[:, 0], moved + windows[:, 1]
+    means = (area(end) - area(begin)) / (end - begin) + offset + 0.002 * rng.standard_normal(n)
+    means[0] = 0.0
+    windows = np.where(np.arange(n)[:, None] > 0, windows, 0.0)
+    return Dataset(
+        u + noise * rng.standard_normal(n),
+        means,
+        dt,
+        windows=dt * windows[:, None],
+        jitter=dt * np.broadcast_to(np.reshape(jitter, (-1, 1)), (n, 1)),
+        input_noise=[noise],
+    )
+
+
+def missing(model, log):
+    """Findings of tests where a fit of one log ended."""
+    fitted = GASSI(model, population=40, generations=8).fit(log)
+    return suspected(fitted, fitted.uncertainty(log), [log]).findings
+
+
+WHOLE = np.tile([-1.0, 0.0], (800, 1))
+
+
+@pytest.mark.parametrize("late", mostly_soak([1.0, 0.0]))
+def test_a_sensor_that_averages_is_late_by_no_more_than_it_is(late):
+    """Means are compared with means: a sample's is half a sample old by itself."""
+    findings = [f for f in missing(LAG, log_of_means(0, WHOLE, late=late)) if f.counts]
+    assert [(f.kind, f.name) for f in findings] == [("delay", "y")] * bool(late)
+    assert all(f.amplitude == pytest.approx(0.01, rel=0.15) for f in findings)
+
+
+@pytest.mark.parametrize(("seed", "offset"), mostly_soak([(3, 0.005), (5, 0.005), (5, 0.0)]))
+def test_means_over_times_that_are_hardly_known_count_little(seed, offset):
+    """Errors of three means in ten are a hundred times those of the others, and hide an offset."""
+    rarely = np.where(np.random.default_rng(100 + seed).random(800) < 0.3, 1.0, 0.01)
+    log = log_of_means(seed, WHOLE, jitter=rarely, offset=offset, noise=0.01)
+    findings = missing(LAG, log)
+    assert {f.kind for f in findings} == {"offset"} if offset else not findings
+    assert all(abs(f.amplitude) == pytest.approx(offset, rel=0.15) for f in findings)
+
+
+def test_noise_of_a_held_input_is_no_play_of_it():
+    """Play takes noise off levels, as whoever knows that there is noise would."""
+    rng = np.random.default_rng(7)
+    windows = rng.uniform([-1.0, 0.1], [-0.6, 0.3], (800, 2))
+    windows[:, 1] += windows[:, 0]
+    assert not missing(LAG, log_of_means(0, windows, jitter=0.1, noise=0.02))
