@@ -187,7 +187,7 @@ def judge(
     missing = [f for f in findings or () if f.kind != "variant"]
     if alternative is not None and alternative.better and alternative.terms:
         # Other functions were asked for beside a test's guess of this one.
-        missing = [f for f in missing if f.kind not in ("function", "disturbance")]
+        missing = [f for f in missing if f.kind not in ("bend", "function", "disturbance")]
     if any(fault.kind == "lag" for fault in doubts):
         missing = [f for f in missing if not f.comes_late]  # the same, seen less sharply
     counting = [f for f in missing if f.counts]

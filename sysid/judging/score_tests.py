@@ -31,6 +31,7 @@ from sysid.judging.findings import Finding, moves_of
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
     Suspect,
+    bend_suspects,
     change_suspects,
     channel_suspects,
     curve_suspects,
@@ -57,7 +58,7 @@ from sysid.uncertainty.sensitivity import (
 from sysid.uncertainty.ties import free_gradient, named_values
 
 _CHANCE = 1e-3  # probability of a finding by chance, all tests together
-_SEVERAL = ("variant", "function", "curve", "disturbance")  # have no single amplitude
+_SEVERAL = ("variant", "bend", "function", "curve", "disturbance")  # have no single amplitude
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
@@ -117,7 +118,7 @@ class ScoreTests:
         if self._exact:
             return []
         runs = self._runs
-        in_equations = [*function_suspects(runs), *cycle_suspects(runs)]
+        in_equations = [*function_suspects(runs), *cycle_suspects(runs), *bend_suspects(runs)]
         return [*in_equations, *curve_suspects(runs), *disturbance_suspects(runs)]
 
     def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
@@ -471,6 +472,12 @@ class _Tests:
     ) -> Finding:
         moved = self._gradients @ result.move[: self._gradients.shape[1]]
         several, amplitudes = suspect.kind in _SEVERAL, result.amplitudes
+        names = [estimate.name for estimate in self._estimates]
+        if suspect.kind == "change" and suspect.name in names:
+            # Whatever its mean, it is not that value at either end of a record.
+            place = names.index(suspect.name)
+            half = 0.5 * float(amplitudes[0]) * self._estimates[place].value
+            moved[place] = max(moved[place], half, key=abs)
         return Finding(
             suspect.kind,
             suspect.name,

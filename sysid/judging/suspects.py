@@ -33,6 +33,7 @@ Kind = Literal[
     "saturation",
     "noise",
     "change",
+    "bend",
     "function",
     "curve",
     "disturbance",
@@ -50,6 +51,14 @@ _PLAYS = (0.02, 0.1)  # parts of an input's peak
 _RECORD = 0.1  # of a record, beyond which no delay is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
+# How a parameter may change with the size, up to 1, of what it multiplies: with it, with its
+# square, and near its zero.
+_BENDS: tuple[Callable[[FloatArray], FloatArray], ...] = (
+    lambda z: z,
+    lambda z: z**2,
+    lambda z: 1.0 / (z + 0.05),
+)
+_PROPORTIONAL = 1e-6  # what a term may be beside a signal that it is in proportion to
 _POINTS = 50  # at which an equation is asked for what it depends on
 # Stribeck speeds that are tried, in parts of the largest speed.
 _STANDSTILL = (0.02, 0.04, 0.08, 0.16, 0.32)
@@ -515,6 +524,55 @@ def _drifting(moved: FloatArray, run: DisturbedRun) -> FloatArray:
     """Change by parameters that move by a part of what others differ by, in proportion to time."""
     rates = (run.rates_of(run.model.derivative, moved) - run.rates) / _PROBE
     return run.added(rates * np.linspace(-0.5, 0.5, len(rates))[:, None])
+
+
+def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """Parameters that change with the size of what they multiply, in all equations alike.
+
+    As the stiffness of a spring between two states that hardens, or has play: no function of a
+    single state tells that. Of a term in one equation that is one ``function_suspects`` tell more.
+    """
+    model, vector = runs[0].model, runs[0].vector
+    signals = np.concatenate([np.hstack([run.states, run.record.inputs]) for run in runs])
+    earlier: list[FloatArray] = []
+    for place, name in enumerate(model.parameter_names):
+        moved = vector.copy()
+        moved[place] += _PROBE * (vector[place] or 1.0)
+        terms = [(run.rates_of(model.derivative, moved) - run.rates) / _PROBE for run in runs]
+        whole = np.concatenate(terms)
+        if not (np.all(np.isfinite(whole)) and np.any(whole)):
+            continue
+        main = int(np.argmax(np.mean(whole**2, axis=0)))
+        along, acting = whole[:, main], int(np.count_nonzero(whole.any(axis=0)))
+        if not all(_alike(whole[:, i], along) for i in range(whole.shape[1])):
+            continue  # it multiplies several things
+        if acting == 1 and any(_alike(signal, along) for signal in signals.T):
+            continue
+        if any(_alike(before, along) for before in earlier):
+            continue
+        earlier.append(along)
+        size = float(np.abs(along).max())
+        columns = [_bent(runs, terms, main, size, bend) for bend in _BENDS]
+        yield Suspect("bend", name, "1", np.stack(columns, axis=2))
+
+
+def _alike(values: FloatArray, along: FloatArray) -> bool:
+    """Whether values are another signal's, (n,) each, times a number, which may be zero."""
+    factor = (values @ along) / max(float(along @ along), 1e-300)
+    error, size = np.abs(values - factor * along).max(), np.abs(values).max()
+    return bool(size == 0.0 or (factor != 0.0 and error <= _PROPORTIONAL * size))
+
+
+def _bent(
+    runs: Sequence[DisturbedRun],
+    terms: Sequence[FloatArray],
+    main: int,
+    size: float,
+    bend: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Changes by terms (n_samples, n_states) of each run times a function of their size."""
+    added = [term * bend(np.abs(term[:, main]) / size)[:, None] for term in terms]
+    return np.concatenate([run.added(part) for run, part in zip(runs, added, strict=True)])
 
 
 def _jumps(signal: FloatArray) -> bool:

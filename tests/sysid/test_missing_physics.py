@@ -511,3 +511,68 @@ def test_noise_of_a_held_input_is_no_play_of_it():
     windows = rng.uniform([-1.0, 0.1], [-0.6, 0.3], (800, 2))
     windows[:, 1] += windows[:, 0]
     assert not missing(LAG, log_of_means(0, windows, jitter=0.1, noise=0.02))
+
+
+TWO_MASSES = ProcessModel(
+    name="two masses",
+    states=(State("x1", "m"), State("v1", "m/s"), State("x2", "m"), State("v2", "m/s")),
+    inputs=(Input("force", "N"),),
+    outputs=(Output("x1", "m"),),
+    parameters=(
+        Parameter("m1", "kg", 2.0, 0.15, 10.0, "log"),
+        Parameter("m2", "kg", 1.0, 0.08, 5.0, "log"),
+        Parameter("k", "N/m", 500.0, 40.0, 2400.0, "log"),
+        Parameter("c", "N*s/m", 2.5, 0.2, 12.0, "log"),
+        Parameter("d", "N*s/m", 7.0, 0.5, 32.0, "log"),
+    ),
+    derivative=lambda x, u, p: (
+        x[1],
+        (u[0] - p[4] * x[1] + p[2] * (x[2] - x[0]) + p[3] * (x[3] - x[1])) / p[0],
+        x[3],
+        (p[2] * (x[0] - x[2]) + p[3] * (x[1] - x[3])) / p[1],
+    ),
+)
+
+
+def two_masses(spring, seed=0, n=800, dt=6e-3, parts=10):
+    """The first mass's position under pulses, by Runge and Kutta; spring: (stretch, time) -> N."""
+    rng = np.random.default_rng(seed)
+    force = np.zeros(n)
+    for k in range(20, n, 20):
+        force[k : k + rng.integers(2, 10)] = rng.choice([-1, 1]) * rng.uniform(8.0, 20.0)
+
+    def rates(x, u, time):
+        pull = spring(x[2] - x[0], time) + 1.5 * (x[3] - x[1])
+        return np.array([x[1], (u - 4.0 * x[1] + pull) / 1.2, x[3], -pull / 0.6])
+
+    x, h, positions = np.zeros(4), dt / parts, np.empty(n)
+    for k in range(n):
+        positions[k] = x[0]
+        for part in range(parts):
+            time = k * dt + part * h
+            a = rates(x, force[k], time)
+            b = rates(x + 0.5 * h * a, force[k], time + 0.5 * h)
+            c = rates(x + 0.5 * h * b, force[k], time + 0.5 * h)
+            d = rates(x + h * c, force[k], time + h)
+            x = x + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+    return Dataset(force, positions + 3e-4 * rng.standard_normal(n), dt)
+
+
+@pytest.mark.parametrize(
+    ("spring", "words"),
+    mostly_soak(
+        [
+            (lambda e, t: 300.0 * e + 8e5 * e**3, "a k that changes with the size"),
+            (lambda e, t: 300.0 * (1.0 - 0.06 * t) * e, "k changes by -3"),
+            (lambda e, t: 300.0 * (e - np.clip(e, -0.002, 0.002)), "a k that changes with the"),
+            (lambda e, t: 300.0 * e, ""),
+        ]
+    ),
+    ids=["hardens", "softens", "has play", "as modelled"],
+)
+def test_a_spring_between_two_masses_that_is_none_is_named(spring, words):
+    log = two_masses(spring)
+    fitted = GASSI(TWO_MASSES, population=60, generations=14).fit(log)
+    parameters = verdict_of(fitted, [log]).parameters
+    assert words in " ".join(parameters.reasons)
+    assert parameters.trust == ("limited" if words else "good")
