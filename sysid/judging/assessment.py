@@ -193,7 +193,8 @@ def judge(
     counting = [f for f in missing if f.counts]
     if not counting and _moved_together(missing) > MOVED:
         counting = missing
-    light += map(_moving, counting)
+    in_vain = alternative.terms if alternative is not None and not alternative.better else ()
+    light += [_in_vain(f) if f.term in in_vain else _moving(f) for f in counting]
     if predicted.trust != "poor":  # which is more than these can say
         if not light:
             light += _unexplained(model, judged)
@@ -543,8 +544,7 @@ def _moving(finding: Finding) -> str:
         for m in finding.moves[:3]
         if abs(m.deviations) > 1.0
     ]
-    chance = "p < 1e-9" if finding.p_value < 1e-9 else f"p = {finding.p_value:.0e}"
-    text = description(finding)
+    chance, text = _chance(finding), description(finding)
     says = "The data ask for " if finding.amplitude is None else ""
     effect = (
         f"with that {', '.join(moved)}"
@@ -553,6 +553,19 @@ def _moving(finding: Finding) -> str:
     )
     # A line leads nowhere that far.
     return f"{says}{text} ({chance})" + (f"; {effect}." if not finding.turned_round else ".")
+
+
+def _in_vain(finding: Finding) -> str:
+    """Reason: a function by which something shows that it is not, as its fit says."""
+    return (
+        f"What is left looks like {description(finding)} ({_chance(finding)}), but fitted with it "
+        "the model explains the data no better: something else is missing, and parameters may be "
+        "off by more than their intervals."
+    )
+
+
+def _chance(finding: Finding) -> str:
+    return "p < 1e-9" if finding.p_value < 1e-9 else f"p = {finding.p_value:.0e}"
 
 
 def _change(old: float, new: float, unit: str) -> str:

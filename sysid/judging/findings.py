@@ -92,8 +92,8 @@ _WORDS = {
 }
 # What has no single amplitude.
 _SHAPES = {
-    "bend": "a {name} that changes with the size of what it multiplies, as of a spring that "
-    "hardens or has play",
+    "bend": "another {name} where what it multiplies is small than where it is large, as of a "
+    "spring that hardens or has play",
     "curve": "a curve between {name} and what is logged of it, as of a sensor that bends",
     "disturbance": "a slow signal in d{name}/dt that nobody measured",
 }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import chdtrc
+from scipy.special import fdtrc
 
 from sysid.arrays import FloatArray
 from sysid.judging.whitener import Whitener
@@ -49,6 +49,7 @@ class Regression:
         self.whitening = whitening
         white, target = whitening(columns), whitening(residual[..., None])
         self._n = len(target)
+        self._left = self._n - white.shape[1] - whitening.model.coefficients.size
         self._basis = _Basis(
             white, free, [whitening.rows_of(r) for r in record_rows(whitening.lengths)]
         )
@@ -74,7 +75,7 @@ class Regression:
         score = (axes[:, new].T @ (columns[rows].T @ self._residual[rows])) / np.sqrt(squares[new])
         if not new.any() or (one_sided and axes[0, 0] * score[0] <= 0.0):
             return math.inf
-        return _log(float(chdtrc(int(new.sum()), score @ score)))
+        return self._log_p(float(score @ score), int(new.sum()))
 
     def _scaled(self, changes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened columns of unit length, those without any left out, and all their lengths."""
@@ -114,12 +115,21 @@ class Regression:
         whole = np.zeros(len(size))
         whole[size > 0.0] = amplitudes / size[size > 0.0]
         return Regressed(
-            _log(float(chdtrc(freedom, self._statistic(left, score)))),
+            self._log_p(self._statistic(left, score), freedom),
             whole,
             self._coefficients + move,
             move,
             min(float(score @ score) / max(self.squares, 1e-300), 1.0),
         )
+
+    def _log_p(self, statistic: float, freedom: int) -> float:
+        """Logarithm of a statistic's probability by chance, of residuals whose variance is theirs.
+
+        Of a short record that is hardly known: Fisher's distribution, not the chi-square's.
+        """
+        left = max(self._left - freedom, 1)
+        chance = float(fdtrc(freedom, left, statistic / freedom * left / self._n))
+        return math.log(chance) if chance > 0.0 else -math.inf
 
     def _statistic(self, left: FloatArray, score: FloatArray) -> float:
         """The score's square in units of its covariance, in every direction the larger of three."""
@@ -234,7 +244,3 @@ def _long_run_covariance(terms: FloatArray) -> FloatArray:
         total = total + (1.0 - lag / _LAGS) * (product + product.T)
     # The weights keep it from being negative but for rounding.
     return total
-
-
-def _log(chance: float) -> float:
-    return math.log(chance) if chance > 0.0 else -math.inf

@@ -67,6 +67,7 @@ _TINY = 1e-300
 _ITERATIONS = 20  # by which residuals' variances settle
 _COMMON = 0.15  # of the windows' jitter, that they may all lie too early or too late
 _NOISE_WIDTH = 3.0  # of an input's noise from low to high, in its deviations
+_FEW = 25  # samples for each amplitude, below which what they leave tells no colour
 _INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
 _REACH = 10.0  # of a term's range in parts of the size that its test found
@@ -387,9 +388,12 @@ class _Tests:
     ) -> tuple[Regressed, FloatArray]:
         """A test by the colour of what the suspect leaves, and what it leaves.
 
-        Where it is there, the residuals' colour is mostly its own, and whitening hides it.
+        Where it is there, the residuals' colour is mostly its own, and whitening hides it. In a
+        short record several amplitudes leave a colour that makes them sure, whatever was there.
         """
         residual = self._left(changes, first)
+        if np.count_nonzero(first.amplitudes) * _FEW > len(changes):
+            return first, residual
         second = self._coloured_by(residual).test(changes, suspect.one_sided)
         if second is None or second.log_p > first.log_p:
             return first, residual

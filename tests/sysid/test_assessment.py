@@ -335,6 +335,12 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     # Beside a term that was fitted no other function is said.
     term = AddedTerm("speed", "speed", "sign", 0.1, -1.0, 1.0)
     added = replace(fitted, name="a term", terms=(term,))
+    in_vain = found([replace(finding("function", 3.0), term=term)], replace(added, better=False))
+    assert in_vain.parameters.reasons == (
+        "What is left looks like a term in the sign of speed in dspeed/dt, like dry friction (p = "
+        "1e-06), but fitted with it the model explains the data no better: something else is "
+        "missing, and parameters may be off by more than their intervals.",
+    )
     others = [finding("function", 3.0), finding("offset", 2.0)]
     reasons = found(others, added).parameters.reasons
     assert [reason.partition(";")[0] for reason in reasons] == [
