@@ -41,7 +41,6 @@ from sysid.judging.suspects import (
     in_single_records,
     likely_noise,
     variant_suspects,
-    with_play,
 )
 from sysid.judging.whitener import Whitener
 from sysid.problem.terms import AddedTerm
@@ -66,7 +65,6 @@ _LIKELY = 8  # suspects that are tested side by side, and again by the colour of
 _TINY = 1e-300
 _ITERATIONS = 20  # by which residuals' variances settle
 _COMMON = 0.15  # of the windows' jitter, that they may all lie too early or too late
-_NOISE_WIDTH = 3.0  # of an input's noise from low to high, in its deviations
 _FEW = 25  # samples for each amplitude, below which what they leave tells no colour
 _INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
@@ -104,8 +102,8 @@ class ScoreTests:
         self._runs = runs = _runs(local)
         noisy = [runs[0].model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
         channels = list(channel_suspects(runs))
-        # Noise of an input makes its gain look smaller: that is no fault.
-        channels = [s for s in channels if s.kind != "gain" or s.name not in noisy]
+        # Noise of an input makes its gain look smaller, and play takes it off: that is no fault.
+        channels = [s for s in channels if s.kind not in ("gain", "play") or s.name not in noisy]
         foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
         foreseen = foreseen[..., foreseen.any(axis=(0, 1))]
         chance = np.concatenate([_noisy_starts(runs, local), _moved_windows(runs)], axis=2)
@@ -148,14 +146,13 @@ def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
     """What the noise of inputs is likely to have done to the outputs, (n_rows, n_outputs, k).
 
     Given what was measured, noise is not zero in the mean: a Wiener filter tells what of an input
-    it probably is. Uncorrelated with any linear function of what was measured is only the rest; of
-    levels that are held play takes the noise away as well, and better.
+    it probably is. Uncorrelated with any linear function of what was measured is only the rest.
     """
     records = [run.record for run in runs]
     columns = []
     noisy = np.any([record.input_noise for record in records], axis=0)
     for i in np.flatnonzero(noisy).tolist():
-        columns += [of_each(runs, partial(part, i)) for part in (_likely_noise, _without_noise)]
+        columns.append(of_each(runs, partial(_likely_noise, i)))
     n = sum(record.n_samples for record in records)
     return np.stack(columns, axis=2) if columns else np.zeros((n, runs[0].outputs.shape[1], 0))
 
@@ -164,13 +161,6 @@ def _likely_noise(i: int, run: DisturbedRun) -> FloatArray:
     """What the noise of input i is likely to have done to the outputs, (n_samples, n_outputs)."""
     part = np.zeros(run.record.inputs.shape)
     part[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
-    return run.driven(part)
-
-
-def _without_noise(i: int, run: DisturbedRun) -> FloatArray:
-    """What play as wide as the noise of input i changes in the outputs."""
-    part = np.zeros(run.record.inputs.shape)
-    part[:, i] = with_play(run.record.inputs[:, i], _NOISE_WIDTH * float(run.record.input_noise[i]))
     return run.driven(part)
 
 

@@ -201,15 +201,8 @@ def input_noise(records: Sequence[Dataset], i: int) -> float:
 
 
 def _with_play(run: DisturbedRun, i: int, width: float) -> FloatArray:
-    return with_play(run.record.inputs[:, i], width)
-
-
-def with_play(signal: FloatArray, width: float) -> FloatArray:
-    """Change of a signal (n,) that is dragged along by the ends of a play.
-
-    >>> with_play(np.array([0.0, 1.0, 0.5, 1.5]), 1.0)
-    array([ 0. , -0.5,  0. , -0.5])
-    """
+    """What acts is dragged along by the ends of the play."""
+    signal = run.record.inputs[:, i]
     at, dragged = float(signal[0]), []
     for value in signal.tolist():
         at = min(max(at, value - 0.5 * width), value + 0.5 * width)
