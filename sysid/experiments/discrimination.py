@@ -111,7 +111,7 @@ def discriminate(
     structure is right. spaces, priors: by the same names, what is searched and what is known; by
     default the models' ranges around their nominal values. benches: by the same names, what a run
     would log if that structure were right. starts: points from which each rival is
-    fitted: where it is likeliest, where it is nearest to the truth, and others anywhere.
+    fitted, the likeliest and others anywhere, beside the one that is nearest to the truth.
 
     Raises ModelError for unknown names, models whose inputs or outputs differ, equations that
     cannot be differentiated, where every candidate would pass a limit, and where no run tells any

@@ -136,9 +136,9 @@ class Tournament:
         return [self.structures[j].values for _, j in self.pairs]
 
     def begins(self, first: Point, count: int) -> list[Point]:
-        """Points that rivals are refitted from, as many: a first, near the truths, and anywhere."""
-        anywhere = (self._drawn() for _ in range(count - 2))
-        return [first, self._nested(), *anywhere][:count]
+        """Points that rivals are refitted from: a first, others anywhere, and near the truths."""
+        anywhere = [self._drawn() for _ in range(count - 1)]
+        return [first, *anywhere, self._nested()]
 
     def _nested(self) -> Point:
         """All rivals at the truths' values, as far as they have the same parameters."""
