@@ -7,7 +7,6 @@ dynamics left in them?), each with 95 % bands (Ljung, "System Identification", s
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal.windows import parzen
 from scipy.special import chdtrc
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
@@ -96,7 +95,7 @@ def _coloured(e: FloatArray, u: FloatArray, n_lags: int) -> FloatArray:
     """
     size, farthest = 2 * len(e), 2 * n_lags
     window = np.zeros(size)
-    window[:farthest] = parzen(2 * farthest - 1)[farthest - 1 :]
+    window[:farthest] = _parzen(np.arange(farthest) / farthest)
     window[-farthest + 1 :] = window[farthest - 1 : 0 : -1]
     spectra_e, spectra_u = (
         np.abs(np.fft.rfft(x, size, axis=0)) ** 2 / np.maximum(np.sum(x**2, axis=0), 1.0)
@@ -107,6 +106,13 @@ def _coloured(e: FloatArray, u: FloatArray, n_lags: int) -> FloatArray:
     for j, i in np.ndindex(covariances.shape[1:]):
         covariances[:, j, i] = np.fft.irfft(smooth[:, j] * spectra_u[:, i])[:n_lags]
     return covariances
+
+
+def _parzen(part: FloatArray) -> FloatArray:
+    """Parzen's weights of lags in parts of the farthest, whose spectrum is nowhere negative."""
+    near = 1.0 - 6.0 * part**2 * (1.0 - part)
+    weights: FloatArray = np.where(part < 0.5, near, 2.0 * (1.0 - part) ** 3)
+    return weights
 
 
 def _chance(cross: FloatArray, variance: FloatArray, covariance: FloatArray) -> FloatArray:
