@@ -183,13 +183,13 @@ def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
     >>> test.ratio.round().tolist(), (test.p_value < 0.01).tolist()
     ([1.0, 3.0], [False, True])
     """
-    variance = expected.variance
+    variance, most = expected.variance, expected.freedom
     ratio, p_value = np.full(len(variance), np.nan), np.full(len(variance), np.nan)
     for j in np.flatnonzero(variance > 0.0):
         measured = residual[np.isfinite(residual[:, j]), j : j + 1]
         if len(measured) < 2:
             continue
         square = float(np.mean(measured**2)) / float(variance[j])
-        freedom = min(independent_samples([measured]), float(expected.freedom[j]))
+        freedom = min(independent_samples([measured]), float(most[j]))
         ratio[j], p_value[j] = np.sqrt(square), chdtrc(freedom, square * freedom)
     return FloorTest(ratio, p_value)

@@ -66,10 +66,10 @@ def residual_test(
     seen = np.isfinite(residual)
     e, u = _standard(residual), _standard(inputs)
     counted = np.maximum(seen.sum(axis=0), 1)
-    auto = np.stack([np.diagonal(_products(e, e, k)) for k in range(n_lags)]) / counted
+    auto = _autocorrelations(e)
     cross = np.stack([_products(e, u, k) for k in range(n_lags)]) / counted[:, None]
     # Both being coloured widens the band: sum over k of R_e(k) R_u(k) / n is the variance.
-    covariance = _coloured(e, u, n_lags) / counted[:, None]
+    covariance = _coloured(auto, u, n_lags) / counted[:, None]
     variance = np.maximum(covariance[0], _LEAST_VARIANCE / counted[:, None])
     if systematic is not None:
         widening = _systematic_variance(systematic, residual, u, n_lags)
@@ -78,7 +78,7 @@ def residual_test(
     tested = (noisy == 0.0) & np.any(u != 0.0, axis=0)
     return ResidualTest(
         lags=np.arange(n_lags),
-        auto=auto,
+        auto=auto[:n_lags],
         auto_band=Z95 / np.sqrt(counted),
         cross=cross,
         cross_band=Z95 * np.sqrt(variance),
@@ -87,24 +87,36 @@ def residual_test(
     )
 
 
-def _coloured(e: FloatArray, u: FloatArray, n_lags: int) -> FloatArray:
+def _autocorrelations(values: FloatArray) -> FloatArray:
+    """Of columns of mean zero, (n, k), at lags from 0 on and, behind them, from -1 back, (2 n, k).
+
+    0 of a column that never changes.
+    """
+    correlations: FloatArray = np.fft.irfft(_spectrum(values), axis=0)
+    return correlations
+
+
+def _spectrum(values: FloatArray) -> FloatArray:
+    """That of the autocorrelations of columns of unit variance, (n + 1, k)."""
+    squares = np.maximum(np.sum(values**2, axis=0), 1.0)
+    spectrum: FloatArray = np.abs(np.fft.rfft(values, 2 * len(values), axis=0)) ** 2 / squares
+    return spectrum
+
+
+def _coloured(auto: FloatArray, u: FloatArray, n_lags: int) -> FloatArray:
     """Covariances of correlations that many lags apart, (n_lags, n_outputs, n_inputs), times n.
 
-    Sums over all j of R_e(j) R_u(j + lag), by Parzen's window as far as they can be told: of slow
-    residuals and inputs that change seldom, correlations are wide, and all lags tell the same.
+    auto: (2 n, n_outputs), as of ``_autocorrelations``. Sums over all j of R_e(j) R_u(j + lag), by
+    Parzen's window as far as they can be told: of slow residuals and inputs that change seldom,
+    correlations are wide, and all lags tell the same.
     """
-    size, farthest = 2 * len(e), 2 * n_lags
-    window = np.zeros(size)
+    farthest, window = 2 * n_lags, np.zeros(len(auto))
     window[:farthest] = _parzen(np.arange(farthest) / farthest)
     window[-farthest + 1 :] = window[farthest - 1 : 0 : -1]
-    spectra_e, spectra_u = (
-        np.abs(np.fft.rfft(x, size, axis=0)) ** 2 / np.maximum(np.sum(x**2, axis=0), 1.0)
-        for x in (e, u)
-    )
-    smooth = np.fft.rfft(window[:, None] * np.fft.irfft(spectra_e, axis=0), axis=0).real
-    covariances = np.zeros((n_lags, e.shape[1], u.shape[1]))
+    smooth, driving = np.fft.rfft(window[:, None] * auto, axis=0).real, _spectrum(u)
+    covariances = np.zeros((n_lags, auto.shape[1], u.shape[1]))
     for j, i in np.ndindex(covariances.shape[1:]):
-        covariances[:, j, i] = np.fft.irfft(smooth[:, j] * spectra_u[:, i])[:n_lags]
+        covariances[:, j, i] = np.fft.irfft(smooth[:, j] * driving[:, i])[:n_lags]
     return covariances
 
 

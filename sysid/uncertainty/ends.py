@@ -6,6 +6,7 @@ low end of its range by chance. That end decides nothing if all would be estimat
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import null_space
@@ -46,12 +47,11 @@ class RangeEnds:
         combined = [e for e in estimates if e.combination and space.names[j] in e.combination.names]
         if any(estimate.why == "end" for estimate in combined):
             return False
-        inverse = self._with(held).curvature
         held[j] = False
         others = [estimate for estimate in estimates if estimate.name != space.names[j]]
         if self._alike(self._by_slopes(self._with(held)), others):
             return True
-        beyond = self._beyond(j, inverse)
+        beyond = self._beyond(j)
         return beyond is not None and self._alike(beyond, others)
 
     def opened(self, free: Covariance, estimates: Sequence[Estimate]) -> list[Estimate]:
@@ -85,11 +85,15 @@ class RangeEnds:
             ties = null_space(ties[:, held].T).T @ ties
         return covariance(self.local, ties, held)
 
-    def _beyond(self, j: int, inverse: FloatArray) -> FloatArray | None:
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        """Inverse curvature, (n_free, n_free), of all that stand on no end."""
+        return self._with(self.on_bound).curvature
+
+    def _beyond(self, j: int) -> FloatArray | None:
         """Search coordinates, (n_free,), of the minimum with parameter j beyond its end.
 
-        inverse: (n_free, n_free), inverse curvature of all that stand on no end: they follow by
-        their slopes. None where a simulation fails beyond.
+        Those that stand on no end follow by their slopes. None where a simulation fails beyond.
         """
         local, objective, at = self.local, self.local.objective, self.local.chromosome
         space = objective.space
@@ -99,13 +103,12 @@ class RangeEnds:
             beyond = at[j] + (-space.width[j] if low else space.width[j])
         there, parameter = at.copy(), space.parameters[j]
         there[j] = min(max(beyond, parameter.minimum), parameter.maximum)
-        values = objective.residuals(np.stack([at, there]), local.steps).values
-        if not np.all(np.isfinite(values)):
+        residual = local.share * objective.residuals(there[None], local.steps).values[..., 0]
+        if not np.all(np.isfinite(residual)):
             return None
-        change = local.share * (values[..., 1] - values[..., 0])
         weights = objective.least_squares_weights(local.residual)
-        push = np.einsum("tip,i,ti->p", local.slopes, weights, change)
-        minimum: FloatArray = space.encode(there) - inverse @ push
+        push = np.einsum("tip,i,ti->p", local.slopes, weights, residual - local.residual)
+        minimum: FloatArray = space.encode(there) - self._inverse @ push
         return minimum
 
     def _alike(self, point: FloatArray, estimates: Sequence[Estimate]) -> bool:
