@@ -432,19 +432,6 @@ def test_an_end_that_the_data_do_not_push_at_hides_nothing():
     assert suspected(estimator, found, [training]) is not None
 
 
-LAG = ProcessModel(
-    name="lag",
-    states=(State("y", "V"),),
-    inputs=(Input("u", "V"),),
-    outputs=(Output("y", "V"),),
-    parameters=(
-        Parameter("tau", "s", 0.1, 0.005, 1.0, "log"),
-        Parameter("k", "1", 1.5, 0.1, 10.0, "log"),
-    ),
-    derivative=lambda x, u, p: ((p[1] * u[0] - x[0]) / p[0],),
-)
-
-
 def log_of_means(seed, windows, jitter=0.0, late=0.0, offset=0.0, noise=0.0, n=800, tau=0.05):
     """Of a lag behind levels, in closed form: means over windows, (n, 2) in samples of 10 ms.
 
@@ -491,7 +478,7 @@ WHOLE = np.tile([-1.0, 0.0], (800, 1))
 @pytest.mark.parametrize("late", mostly_soak([1.0, 0.0]))
 def test_a_sensor_that_averages_is_late_by_no_more_than_it_is(late):
     """Means are compared with means: a sample's is half a sample old by itself."""
-    findings = [f for f in missing(LAG, log_of_means(0, WHOLE, late=late)) if f.counts]
+    findings = [f for f in missing(lag(), log_of_means(0, WHOLE, late=late)) if f.counts]
     assert [(f.kind, f.name) for f in findings] == [("delay", "y")] * bool(late)
     assert all(f.amplitude == pytest.approx(0.01, rel=0.15) for f in findings)
 
@@ -501,7 +488,7 @@ def test_means_over_times_that_are_hardly_known_count_little(seed, offset):
     """Errors of three means in ten are a hundred times those of the others, and hide an offset."""
     rarely = np.where(np.random.default_rng(100 + seed).random(800) < 0.3, 1.0, 0.01)
     log = log_of_means(seed, WHOLE, jitter=rarely, offset=offset, noise=0.01)
-    findings = missing(LAG, log)
+    findings = missing(lag(), log)
     assert {f.kind for f in findings} == {"offset"} if offset else not findings
     assert all(abs(f.amplitude) == pytest.approx(offset, rel=0.15) for f in findings)
 
@@ -511,7 +498,7 @@ def test_noise_of_a_held_input_is_no_play_of_it():
     rng = np.random.default_rng(7)
     windows = rng.uniform([-1.0, 0.1], [-0.6, 0.3], (800, 2))
     windows[:, 1] += windows[:, 0]
-    assert not missing(LAG, log_of_means(0, windows, jitter=0.1, noise=0.02))
+    assert not missing(lag(), log_of_means(0, windows, jitter=0.1, noise=0.02))
 
 
 TWO_MASSES = ProcessModel(
