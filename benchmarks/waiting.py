@@ -2,11 +2,13 @@
 
 python -m benchmarks.waiting [--json] [--base COMMIT] [--runs 3] [--first] [COMMAND ...]
 python -m benchmarks.waiting [--json] [--base COMMIT] [--runs 3] --logs 1,4,8
+python -m benchmarks.waiting [--json] [--base COMMIT] [--runs 3] --catalogue 10000
 
 Seconds by the clock and of the processors (which hardly depend on what else the machine does), to
 the last line of the printed tables and to the end; the least of some runs. --base: the same of
 another commit, its sources in a worktree of their own, turn by turn with these. --first: the run
-that compiles, too. --logs: so many logs identified jointly instead, a PRBS each. Not on Windows.
+that compiles, too. --logs: so many logs identified jointly instead, a PRBS each. --catalogue: so
+many identified runs listed and searched instead, which have been looked at before. Not on Windows.
 The search alone is timed by ``benchmarks.identification``.
 """
 
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -37,8 +40,9 @@ _MEASURES = ("table", "table_cpu", "whole", "whole_cpu")
 class Command:
     """Words behind ``rig``, and bars in seconds by the clock on two quiet cores.
 
-    {run}, {validation}: folders of runs; {parameters}: identified from them; {logs}: as many logs
-    as ``logs`` says. table: to the printed tables. first: whether nothing is compiled yet.
+    {run}, {validation}: folders of runs; {parameters}: identified from them; {many}: a folder of
+    identified ones; {logs}: as many logs as ``logs`` says. table: to the printed tables. first:
+    whether nothing is compiled yet.
     """
 
     words: str
@@ -56,6 +60,11 @@ COMMANDS = {
     "models": Command("models", 0.5),
 }
 FIRST = {"first": Command("run prbs.yaml --identify", 25.0, first=True)}
+CATALOGUE = {
+    "list": Command("runs --in {many}", 1.0),
+    "search": Command("runs --in {many} 'K_m>0.1'", 1.0),
+    "word": Command("runs --in {many} prbs --sort K_m --last 20", 1.0),
+}
 JOINT_BARS = {8: 6.0}  # by number of logs
 
 
@@ -66,6 +75,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3, help="of which the least counts")
     parser.add_argument("--first", action="store_true", help="the run that compiles, too")
     parser.add_argument("--logs", help="numbers of logs that are identified jointly, as 1,4,8")
+    parser.add_argument("--catalogue", type=int, default=0, help="runs that are listed, searched")
     options = parser.parse_args()
     if unknown := set(options.commands) - set(COMMANDS):
         parser.error(f"no command {', '.join(unknown)}; there are {', '.join(COMMANDS)}")
@@ -73,11 +83,13 @@ def main() -> None:
     if options.logs:
         counts = list(map(int, options.logs.split(",")))
         commands = {f"{count} logs": _joint(count) for count in counts}
+    if options.catalogue:
+        commands = CATALOGUE
     with _sources(options.base) as base, tempfile.TemporaryDirectory() as folder:
         trees = {"here": _ROOT} | ({} if base is None else {options.base: base})
         most = max(command.logs for command in commands.values())
         logs = prbs_logs(Path(folder), most)
-        places = {name: _prepared(tree, Path(folder) / str(k))
+        places = {name: _prepared(tree, Path(folder) / str(k), options.catalogue)
                   for k, (name, tree) in enumerate(trees.items())}  # fmt: skip
         figures = {
             name: _least(command, trees, places, logs, 1 if command.first else options.runs)
@@ -110,14 +122,21 @@ def _sources(commit: str | None) -> Iterator[Path | None]:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True)
 
 
-def _prepared(tree: Path, place: Path) -> dict[str, str]:
+def _prepared(tree: Path, place: Path, n_catalogued: int) -> dict[str, str]:
     """A working folder with runs, identified by these sources; what commands are filled with."""
     place.mkdir()
     _timed(["run", "prbs.yaml", "--identify"], tree, place, None)
     run, validation = sorted((place / "runs").iterdir())
-    found = run / "identification" / "parameters.yaml"
+    parameters, many = run / "identification" / "parameters.yaml", place / "many"
+    for k in range(n_catalogued):
+        copy = many / f"{k:05d}" / "identification"
+        copy.mkdir(parents=True)
+        shutil.copy(run / "run.json", copy.parent)
+        shutil.copy(parameters, copy)
+    if n_catalogued:
+        _timed(["runs", "--in", str(many)], tree, place, None)
     return {"place": str(place), "run": str(run), "validation": str(validation),
-            "parameters": str(found)}  # fmt: skip
+            "parameters": str(parameters), "many": str(many)}  # fmt: skip
 
 
 def _least(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.catalogue.entries import RunEntry
-from daq.errors import ConfigError, RigError, RunError, suggestion
+from daq.errors import ConfigError, RigError, RunError
 from daq.files import write_whole
 from daq.identification.rows import QuantityRow
 from daq.progress import Note, Watch, ignore
@@ -22,15 +22,6 @@ if TYPE_CHECKING:
 _SIGNALS = ("current_motor", "current_brake", "torque", "omega")
 _MOST_LINES = 12  # runs whose signals are drawn over each other
 _MOST_TRENDS = 12  # parameters that are drawn where none are named
-
-
-def require_quantities(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
-    """Raise ConfigError for a parameter or combination that no run has."""
-    for name in names:
-        if not any(name in entry.values for entry in entries):
-            present = dict.fromkeys(quantity for entry in entries for quantity in entry.values)
-            cure = suggestion(name, list(present))
-            raise ConfigError(f"no run has {name!r}", cure=cure, key="--parameters")
 
 
 def quantities_of(entries: Sequence[RunEntry]) -> list[str]:

@@ -12,13 +12,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from pydantic_core import from_json
+
 from daq.config import json_file, yaml_file
 from daq.errors import RigError
 from daq.identification.request import PARAMETERS
 from daq.identification.rows import ParameterRow, QuantityRow, Rows
-from daq.logs.capture import LOG_NAME, RUN_NAME
+from daq.logs.capture import LOG_NAME, RUN_NAME, settings_of
 from daq.logs.metadata import METADATA_NAME, read_metadata
-from daq.logs.recording import settings_of
 
 _IDENTIFICATION = "identification"  # the folder of a run's own identification
 _FILES = (RUN_NAME, METADATA_NAME, f"{_IDENTIFICATION}/{PARAMETERS}")
@@ -52,13 +53,17 @@ class RunEntry:
     @cached_property
     def values(self) -> dict[str, float]:
         """Identified parameters and combinations by name."""
-        return {name: value for name, value, *_ in json.loads(self.rows)}
+        return {name: value for name, value, *_ in from_json(self.rows)}
 
-    @cached_property
+    @property
+    def described(self) -> dict[str, Any]:
+        """What is known of it without its identification's numbers, by key."""
+        return {**self.metadata, **{key: getattr(self, key) for key in _TEXTS}}
+
+    @property
     def facts(self) -> dict[str, Any]:
         """Everything that can be asked for, by key: its own, metadata, values of quantities."""
-        texts = {key: getattr(self, key) for key in _TEXTS}
-        return {**self.values, **self.metadata, **texts}
+        return {**self.values, **self.described}
 
     def fact(self, key: str) -> Any:
         """One of the facts; None where it is not known."""
@@ -69,7 +74,7 @@ class RunEntry:
     @cached_property
     def quantities(self) -> tuple[QuantityRow, ...]:
         """Identified parameters and combinations."""
-        return tuple(map(_quantity, json.loads(self.rows)))
+        return tuple(map(_quantity, from_json(self.rows)))
 
     @property
     def document(self) -> dict[str, Any]:
@@ -203,5 +208,5 @@ def to_text(entry: RunEntry) -> str:
 
 def from_text(text: str) -> RunEntry:
     """An entry from its line. Raises ValueError, TypeError or KeyError for what is none."""
-    document = json.loads(text)
+    document = from_json(text)
     return RunEntry(**{**document, "problems": tuple(document["problems"])})

@@ -103,6 +103,15 @@ def ordered(entries: Sequence[RunEntry], key: str) -> list[RunEntry]:
     return sorted(entries, key=place)
 
 
+def require_quantities(entries: Sequence[RunEntry], names: Sequence[str]) -> None:
+    """Raise ConfigError for a parameter or combination that no run has."""
+    for name in names:
+        if not any(name in entry.values for entry in entries):
+            present = dict.fromkeys(quantity for entry in entries for quantity in entry.values)
+            cure = suggestion(name, list(present))
+            raise ConfigError(f"no run has {name!r}", cure=cure, key="--parameters")
+
+
 def _parsed(root: Path, entries: Sequence[RunEntry], terms: Iterable[str]) -> Query:
     folders, conditions, words = set(), [], []
     for term in terms:
@@ -134,8 +143,7 @@ def _folder(root: Path, term: str) -> str | None:
 
 def _checked(entries: Sequence[RunEntry], condition: Condition) -> Condition:
     """A condition that can be asked; ConfigError where an order wants a number or a date."""
-    facts = [entry.fact(condition.key) for entry in entries]
-    numbers = any(isinstance(fact, int | float) for fact in facts)
+    numbers = any(isinstance(entry.fact(condition.key), int | float) for entry in entries)
     if numbers and condition.operator in _ORDERS:
         try:
             float(condition.value)
@@ -158,6 +166,6 @@ def _require_key(entries: Sequence[RunEntry], key: str, place: str) -> str:
 
 
 def _texts(entry: RunEntry) -> list[str]:
-    facts = [fact for key, fact in entry.facts.items() if key not in entry.values]
+    facts = entry.described.values()
     parts = [part for fact in facts for part in (fact if isinstance(fact, list) else [fact])]
     return [str(part).casefold() for part in parts]

@@ -116,9 +116,8 @@ def _document(result: SessionResult) -> dict[str, Any]:
 
 def _show_rest(folder: Path, on_rig: str) -> None:
     """What the sensors read at zero command, by the calibration, and what may follow on the rig."""
-    from daq.logs.capture import LOG_NAME
+    from daq.logs.capture import LOG_NAME, read_record
     from daq.logs.columns import UNITS
-    from daq.logs.recording import read_record
     from daq.lookup.starter import FIRST_EXPERIMENTS
     from daq.notation import quantity
 

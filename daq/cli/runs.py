@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from daq.identification.rows import QuantityRow
 
 _FACTS = ("protocol", "rig", "status", "trust")
+_MOST_ROWS = 200  # on a terminal, unless more are asked for
 _MOST_COLUMNS = 6  # runs beside each other in a table
 _RUN_COLUMN = 19  # characters
 
@@ -59,9 +60,8 @@ def runs(
 ) -> None:
     """List recorded runs; search, compare and annotate them."""
     from daq.catalogue.annotation import annotate
-    from daq.catalogue.comparison import draw_comparison, require_quantities
     from daq.catalogue.index import catalogue
-    from daq.catalogue.query import ordered, select
+    from daq.catalogue.query import ordered, require_quantities, select
     from daq.errors import ConfigError
 
     names = [name.strip() for name in (parameters or "").split(",") if name.strip()]
@@ -77,6 +77,8 @@ def runs(
                 raise ConfigError("no run is meant, and nothing was noted", cure=cure)
             chosen = annotate(folder, chosen, note or [], tag or [], untag or [])
         if plot is not None and chosen:
+            from daq.catalogue.comparison import draw_comparison
+
             draw_comparison(folder, chosen, names, plot, watch)
     if json:
         terminal.print_json({"folder": str(folder), "runs": [run.document for run in chosen]})
@@ -90,19 +92,23 @@ def runs(
     elif compare:
         _compare(chosen, names)
     else:
-        _list(chosen, names, f"{len(chosen)} of {len(entries)} runs in {folder}")
+        room = len(chosen) if last or not sys.stdout.isatty() else _MOST_ROWS
+        _list(chosen, names, f"{len(chosen)} of {len(entries)} runs in {folder}", room)
     for problem in (problem for entry in chosen for problem in entry.problems):
         terminal.report("warning", problem)
     if plot is not None and chosen:
         print(f"Figure: {plot}")
 
 
-def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str) -> None:
-    """A row for each run; what none of them has is left out.
+def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str, room: int) -> None:
+    """A row for each run, of the last for which there is room; what none of them has is left out.
 
     A terminal has little room: what is the same in all runs is said once there, above them, and a
     date only where the run's name does not begin with it.
     """
+    if len(entries) > room:
+        terminal.report("note", f"the last {room} are shown; --last N shows so many")
+        entries = entries[-room:]
     noted = list(dict.fromkeys(key for entry in entries for key in entry.metadata))
     head = ["run", "date (UTC)", *_FACTS, *names, *noted]
     rows = [

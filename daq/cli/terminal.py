@@ -177,21 +177,24 @@ def print_table(
     The first column and those named in ``text`` are text, the others numbers. On a narrow terminal
     heads and text are wrapped between words; nothing is cut.
     """
+    words = [index == 0 or name in text for index, name in enumerate(head)]
+    if not sys.stdout.isatty():
+        print(title, *_piped([head, *rows], words), sep="\n")
+        return
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     # A unit in brackets is no markup, nor is text between colons an emoji.
     console = Console(file=sys.stdout, highlight=False, markup=False, emoji=False)
-    words = [index == 0 or name in text for index, name in enumerate(head)]
     columns = [[name, *_lines(row[index] for row in rows)] for index, name in enumerate(head)]
     whole = [max(map(len, column)) for column in columns]
-    narrow = console.is_terminal and sum(whole) + 3 * len(head) > console.width
+    narrow = sum(whole) + 3 * len(head) > console.width
     room = console.width - 2 * (len(head) - 1)
     widths = _narrowed(columns, words, room) if narrow else whole
     table = Table(
         header_style="bold", pad_edge=False, padding=(0, 1, 0, 0) if narrow else (0, 1),
-        box=box.SIMPLE_HEAD if console.is_terminal else box.SIMPLE, show_edge=not narrow,
+        box=box.SIMPLE_HEAD, show_edge=not narrow,
     )  # fmt: skip
     for name, width, is_text in zip(head, widths, words, strict=True):
         table.add_column(
@@ -208,6 +211,17 @@ def print_table(
     console.print(blank, end="")
     console.print(table)
     console.print(blank, end="")
+
+
+def _piped(rows: Iterable[Sequence[str]], words: Sequence[bool]) -> list[str]:
+    """Lines of a table, its head first; words: the columns that are text, the others numbers."""
+    columns = []
+    for cells, is_text in zip(zip(*rows, strict=True), words, strict=True):
+        whole = [" ".join(cell.splitlines()) for cell in cells]
+        width = max(map(len, whole))
+        columns.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in whole])
+    head, *lines = ("   ".join(row).rstrip() for row in zip(*columns, strict=True))
+    return ["", head, "─" * max(map(len, (head, *lines))), *lines, ""]
 
 
 def print_table_of_differences(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from daq import notation
 from daq.errors import ConfigError
-from daq.logs.recording import read_record, settings_of
+from daq.logs.capture import read_record, settings_of
 from daq.lookup.shipped import find_file
 
 if TYPE_CHECKING:

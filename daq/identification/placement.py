@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from daq.identification.records import LoggedRecord
-from daq.logs.recording import read_record, settings_of
+from daq.logs.capture import read_record, settings_of
 from daq.lookup.models import DEFAULT_MODEL
 from sysid import ProcessModel
 from sysid.problem.faults import DataFault, Part

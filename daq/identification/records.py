@@ -18,10 +18,10 @@ from daq.hal import FloatArray, IntArray
 from daq.identification.foreign import TIME_UNIT, ColumnMapping, read_foreign
 from daq.identification.selection import EVERYTHING, Selection
 from daq.logs import matlab
-from daq.logs.capture import LOG_NAME, RUN_NAME
+from daq.logs.capture import LOG_NAME, RUN_NAME, read_record, settings_of
 from daq.logs.columns import COLUMNS, ORIGINAL_COLUMNS
 from daq.logs.encoder import SPEED, MeanSpeeds
-from daq.logs.recording import Recording, end_of_run, log_path, read_record, settings_of
+from daq.logs.recording import Recording, end_of_run, log_path
 from daq.logs.recording import load as load_recording
 from daq.logs.table import column_names
 from daq.logs.time_base import refuse_rows, require_rows, time_base

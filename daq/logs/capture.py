@@ -8,10 +8,12 @@ import json
 import platform
 import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from daq.config import json_file
 from daq.config.metadata import Metadata
 from daq.errors import ConfigError, RunError
 from daq.files import make_folder, write_whole
@@ -101,6 +103,21 @@ class Capture:
                 digest = hashlib.file_digest(log, "sha256").hexdigest()
             self.record["log"] = {"file": LOG_NAME, "sha256": digest}
             self.save()
+
+
+def read_record(csv: Path) -> dict[str, Any] | None:
+    """run.json beside a log.csv; None when there is none. ConfigError when it is malformed."""
+    path = csv.parent / RUN_NAME
+    if not is_log(csv) or not path.exists():
+        return None
+    return json_file.load(path, "run record", "move it away to use the log alone")
+
+
+def settings_of(record: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Experiment and rig of a run.json; empty where a record of another program lacks them."""
+    sections = [record.get(key) for key in ("experiment", "rig")]
+    experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
+    return experiment, rig
 
 
 def is_log(csv: Path) -> bool:

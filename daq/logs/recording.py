@@ -12,11 +12,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from daq.config import json_file
 from daq.config.rig import Encoder
 from daq.errors import ConfigError
 from daq.hal import Samples
-from daq.logs.capture import COMPLETED, LOG_NAME, RUN_NAME, RUNNING, further_parts, is_log
+from daq.logs.capture import (
+    COMPLETED,
+    LOG_NAME,
+    RUN_NAME,
+    RUNNING,
+    further_parts,
+    is_log,
+    read_record,
+    settings_of,
+)
 from daq.logs.columns import ATTRIBUTES, COLUMNS, ORIGINAL_COLUMNS, UNITS
 from daq.logs.encoder import SPEED, MeanSpeeds, mean_speeds
 from daq.logs.table import column_names, read_table
@@ -175,21 +183,6 @@ def load_whole(path: str | Path) -> Recording:
 def log_path(path: Path) -> Path:
     """The CSV that a folder or file name given by a user means."""
     return path / LOG_NAME if path.is_dir() else path
-
-
-def read_record(csv: Path) -> dict[str, Any] | None:
-    """run.json beside a log.csv; None when there is none. ConfigError when it is malformed."""
-    path = csv.parent / RUN_NAME
-    if not is_log(csv) or not path.exists():
-        return None
-    return json_file.load(path, "run record", "move it away to use the log alone")
-
-
-def settings_of(record: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Experiment and rig of a run.json; empty where a record of another program lacks them."""
-    sections = [record.get(key) for key in ("experiment", "rig")]
-    experiment, rig = (section if isinstance(section, dict) else {} for section in sections)
-    return experiment, rig
 
 
 def end_of_run(csv: Path, record: dict[str, Any] | None, torn: bool) -> str | None:

@@ -13,8 +13,8 @@ from daq.errors import USER_CODE_ERRORS, ConfigError, RigError, RunError, nearby
 from daq.experiment import ClosedLoop, Experiment
 from daq.files import make_folder, write_whole
 from daq.findings import Findings
-from daq.logs.capture import LOG_NAME, RUN_NAME
-from daq.logs.recording import end_of_run, load, log_path, read_record
+from daq.logs.capture import LOG_NAME, RUN_NAME, read_record
+from daq.logs.recording import end_of_run, load, log_path
 from daq.lookup.classes import find_class
 from daq.progress import Watch, ignore, warn
 from daq.run.protocol import failure

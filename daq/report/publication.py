@@ -21,7 +21,7 @@ from daq.identification.draft import Draft
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import PARAMETERS, SettingsRequest
 from daq.identification.result import Identification, errors_document
-from daq.logs.recording import read_record, settings_of
+from daq.logs.capture import read_record, settings_of
 from daq.lookup.models import DEFAULT_MODEL
 from daq.progress import Progress, Watch, ignore
 from daq.report.latex import latex, latex_errors

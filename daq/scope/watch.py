@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from daq.errors import ConfigError
-from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING
-from daq.logs.recording import log_path, read_record, settings_of
+from daq.logs.capture import LOG_NAME, RUN_NAME, RUNNING, read_record, settings_of
+from daq.logs.recording import log_path
 from daq.process import RunProcess
 from daq.scope.history import History
 from daq.scope.tail import LogTail

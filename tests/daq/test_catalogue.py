@@ -184,6 +184,31 @@ def test_eighty_columns_hold_what_is_listed_compared_and_refused(lab):
     assert "known are" in refused and "parameters, predictions, protocol" in refused
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
+def test_a_terminal_shows_the_last_of_many_runs_and_a_pipe_all(tmp_path):
+    for k in range(300):
+        folder = tmp_path / "runs" / f"{k:03d}-run"
+        folder.mkdir(parents=True)
+        (folder / "log.csv").touch()
+    piped = rig("runs", cwd=tmp_path).stdout.splitlines()
+    assert [line.split()[0] for line in piped if "-run" in line] == [
+        f"{k:03d}-run" for k in range(300)
+    ]
+    shown = on_terminal(["runs"], tmp_path, columns=80)
+    assert "300 of 300 runs" in shown and "the last 200 are shown; --last N" in shown
+    assert shown.count("-run") == 200 and "299-run" in shown
+    assert on_terminal(["runs", "--last", "250"], tmp_path, columns=80).count("-run") == 250
+
+
+def test_in_a_pipe_a_run_is_one_line_whatever_is_noted_of_it(tmp_path):
+    folder = tmp_path / "runs" / "noted"
+    folder.mkdir(parents=True)
+    (folder / "log.csv").touch()
+    rig("runs", "noted", "--note", "note=first line\nsecond line", cwd=tmp_path)
+    (line,) = [line for line in rig("runs", cwd=tmp_path).stdout.splitlines() if "noted" in line]
+    assert line.split("   ")[-1] == "first line second line"
+
+
 def test_runs_without_samples_are_left_out_of_a_figure_and_of_an_identification(lab, tmp_path):
     for capture in captures(lab):
         shutil.copytree(lab / capture, tmp_path / capture)
