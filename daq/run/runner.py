@@ -256,7 +256,7 @@ class _Run:
         """Status and reason of a run that ended by an error."""
         where = f"during {self.sampling.phase.value}"
         if isinstance(error, KeyboardInterrupt):
-            return "stopped", f"stopped by Ctrl-C {where}"
+            return "stopped", f"stopped by hand (Ctrl-C, or Stop in the scope) {where}"
         if isinstance(error, Terminated):
             return "stopped", f"stopped by {error} {where}"
         return _STATUS.get(type(error), "failed"), str(error)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from daq.hal import FloatArray, IntArray
+from daq.logs.columns import UNITS
 from daq.scope.history import History
 
 BEFORE = 0.2  # of the stretch that is shown: what comes before the trigger
@@ -65,7 +66,8 @@ class Trigger:
 
     def text(self) -> str:
         """What it waits for, and when that came last."""
-        what = f"{self.channel} {'rises' if self.rising else 'falls'} through {self.level:.4g}"
+        level = f"{self.level:.4g} {UNITS.get(self.channel, '')}".rstrip()
+        what = f"{self.channel} {'rises' if self.rising else 'falls'} through {level}"
         return f"{what}: " + ("not yet" if self.at is None else f"last at {self.at:.6g} s")
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from bokeh.models.widgets import NumericInput, RadioButtonGroup, Select, Toggle
 
+from daq.logs.columns import UNITS
 from daq.scope.trigger import Trigger
 
 _EDGES = ("no trigger", "rises", "falls")
@@ -40,7 +41,9 @@ class TriggerControls:
 
     def offer(self, channels: Sequence[str]) -> None:
         """Let one of these channels be chosen."""
-        options: list[Any] = list(channels)
+        options: list[Any] = [
+            (name, f"{name} [{UNITS[name]}]" if UNITS.get(name) else name) for name in channels
+        ]
         self._channel.options = options
         if self._channel.value not in channels:
             self._channel.value = channels[0] if channels else ""

@@ -179,9 +179,10 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 PHASES = ("open", "calibration", "homing", "run", "safe", "close")
 METHODS = {"open": "open", "safe": "announce", "close": "close"}  # that act
+_BY_HAND = "hand (Ctrl-C, or Stop in the scope)"
 SIGNALS = {
-    "SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "SIGHUP",
-    "SIGINT+SIGINT@safe": "Ctrl-C", "SIGINT+SIGINT@close": "Ctrl-C",
+    "SIGINT": _BY_HAND, "SIGTERM": "SIGTERM", "SIGHUP": "SIGHUP",
+    "SIGINT+SIGINT@safe": _BY_HAND, "SIGINT+SIGINT@close": _BY_HAND,
 }  # fmt: skip
 
 
@@ -219,8 +220,8 @@ def exits():
     yield Exit("run", "full", "failed", "log.csv: cannot be written: File too large")
     yield Exit("run", "unplugged", "failed", "the device no longer answers", closed_loop=True)
     yield Exit("run", "nan", "interlock", "interlock in sample 1: torque", closed_loop=True)
-    yield Exit("run", "SIGINT", "stopped", "stopped by Ctrl-C", closed_loop=True)
-    yield Exit("run", "SIGINT+SIGINT@safe", "stopped", "stopped by Ctrl-C", closed_loop=True)
+    yield Exit("run", "SIGINT", "stopped", "stopped by hand", closed_loop=True)
+    yield Exit("run", "SIGINT+SIGINT@safe", "stopped", "stopped by hand", closed_loop=True)
     yield Exit("run", "full", "failed", "log.csv: cannot be written", closed_loop=True)
 
 

@@ -357,18 +357,26 @@ def test_losing_the_last_samples_of_a_run_is_no_complete_run(tmp_path, plugin):
 
 
 @pytest.mark.parametrize(
-    ("number", "by"), mostly_soak([(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+    ("number", "said", "recorded"),
+    mostly_soak(
+        [
+            (signal.SIGINT, "Ctrl-C", "hand (Ctrl-C, or Stop in the scope)"),
+            (signal.SIGTERM, "SIGTERM", "SIGTERM"),
+        ]
+    ),
 )
-def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(tmp_path, plugin, number, by):
+def test_a_signal_stops_a_run_in_real_time_with_its_log_whole(
+    tmp_path, plugin, number, said, recorded
+):
     write_experiment(tmp_path / "e.yaml", duration=30)
     write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
     process, folder = run_in_progress(tmp_path, env=plugin)
     process.send_signal(number)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 1, errors
-    assert f"stopped by {by}" in errors and "Traceback" not in errors
+    assert f"stopped by {said}" in errors and "Traceback" not in errors
     record = record_of(folder)
-    assert (record["status"], record["reason"]) == ("stopped", f"stopped by {by} during run")
+    assert (record["status"], record["reason"]) == ("stopped", f"stopped by {recorded} during run")
     recording = load(folder)
     assert 50 <= len(recording.frame) < 24_000
     assert "ended early: stopped" in recording.warning

@@ -155,7 +155,7 @@ def test_it_follows_a_run_of_the_rig_from_its_beginning_to_its_end(scope, tmp_pa
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
     until(lambda: ">stopped<" in tab.head(), "the run's end")
-    assert "stopped by Ctrl-C during run" in tab.head()
+    assert "stopped by hand (Ctrl-C, or Stop in the scope) during run" in tab.head()
     (folder,) = (tmp_path / "runs").iterdir()
     log = load(folder / "log.csv").frame
     last = log["t"].iloc[-1]
@@ -196,7 +196,7 @@ def test_channels_views_and_the_stop_button_in_a_narrow_window(scope, tmp_path):
         until(lambda: tab.model("stop", "m.visible"), "the stop button")
         tab.find(".bk-btn-danger").click()
         process.communicate(timeout=60)
-    until(lambda: "stopped by Ctrl-C" in tab.head(), "the run's end")
+    until(lambda: "stopped by hand" in tab.head(), "the run's end")
     until(lambda: not tab.model("stop", "m.visible"), "no button for what has ended")
     tab.driver.set_window_size(1300, 1200)
 
@@ -254,6 +254,7 @@ def test_a_trigger_holds_where_it_is_and_earlier_runs_lie_behind(scope, tmp_path
         rises = np.flatnonzero((sine[1:] >= 0.5) & (sine[:-1] < 0.5)) + 1
         at = rises[rises / RATE + 0.16 < (n - 1) / RATE][-1] / RATE
         until(lambda: tab.time() == pytest.approx((at - 0.04, at + 0.16)), "the trigger")
+        assert "trigger: torque rises through 0.5 N*m: last at" in tab.head()
         assert tab.model("lines", "m.data.time") == [at]
         assert tab.model("level of the trigger", "Array.from(m.data_source.data.y)") == [0.5]
         tab.model("once", "(m.active = true)")
