@@ -95,7 +95,7 @@ class ComparisonResult(Shown):
     parameters by model. request_words: what the command line named besides models and logs.
 
     >>> from daq import ComparisonRequest, compare, record
-    >>> quick = SettingsRequest(options={"preset": "thesis", "generations": 2})
+    >>> quick = SettingsRequest(options={"preset": "thesis", "generations": 3})
     >>> logs = [record("prbs.yaml").folder], [record("prbs.yaml", validation=True).folder]
     >>> result = compare(ComparisonRequest(*logs, baselines=["ARX"], settings=quick))
     >>> result.comparison.preferred, result.file.name

@@ -1,17 +1,24 @@
 """When an encoder measured the speed that a log shows.
 
 A counter that times its edges tells the speed as one count over the time between the last two of
-them: a mean over an interval that has ended before the sample. Log and calibration tell where it
+them, a mean over an interval that has ended before the sample. Log and calibration tell where it
 lies,
 
 - its length T from the speed, count / |omega|, or, where the shaft has turned round and the speed
   is zero, from the edges at its ends;
-- its end from the sample in which the count has changed, to within a sample time, and closer as it
-  began where the interval before it ended. With several edges in a sample the last is half an
-  interval old on average.
+- its end, the last edge, from the sample in which the count has changed, no more than T before its
+  end. Of several edges in a sample the one before the last came in it, too, and closer as intervals
+  begin where those before them ended.
 
 Samples within an interval that is longer than a sample are given its mean, which the device could
 not know before it was over; what it showed instead is that of the interval before.
+
+A speed is never more than one count over the time since the last edge: where no edge comes for long
+it is a bound. In samples without an edge it tells when the last one was. In the sample of the edge
+itself nothing says whether it is a bound or a mean, if the shaft slows down. The part a T^2 / count
+of such speeds is bounds (a deceleration, edges at any phase), means over times T that end between T
+before the sample and the sample: on average where means over intervals end. Before a turn they are
+means of nothing.
 """
 
 from __future__ import annotations
@@ -27,9 +34,12 @@ SPEED = "omega"  # the column that a counter's rate makes
 
 _OFF_COUNT = 0.05  # counts that a printed angle may be off a whole one
 _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
-_CREDIBLE = 0.85, 1.2  # change of the speed within an interval that its neighbour can tell
+_CREDIBLE = 1.5  # growth of the speed within an interval that its neighbour can tell
+_LOST = 0.5  # part of the speed that is lost in an interval before a turn, which tells no mean
+_LOWER = 1.0 - 1e-6  # parts of a speed below which another is lower
 _FEWEST, _SHARE = 3, 0.8  # of the intervals that can be checked, those that must agree
-# Samples of a mean of zero for which it does not matter when exactly its edges were.
+# Samples of a mean of zero for which it does not matter when exactly its edges were, nor that none
+# has come yet.
 _REST = 20.0
 _MANY = 20  # intervals that contradict what somebody says
 
@@ -50,6 +60,70 @@ class MeanSpeeds:
 
 
 @dataclass(frozen=True)
+class _Changes:
+    """Samples in which the count has changed, (n,) each, times in ticks and rates in counts a tick.
+
+    latest: time of the sample, the last edge was no later. gap: since the sample before. moved:
+    counts, NaN in the first. length: of the interval, infinite for a turn. next_rate, pause: the
+    rate at the sample behind and the time until it.
+    """
+
+    rows: IntArray  # of the log
+    latest: FloatArray
+    gap: FloatArray
+    moved: FloatArray
+    rate: FloatArray
+    length: FloatArray
+    next_rate: FloatArray
+    pause: FloatArray
+
+    @classmethod
+    def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray) -> _Changes:
+        """rates: in counts per tick."""
+        rows = np.flatnonzero(np.diff(counts, prepend=np.nan))
+        behind = np.minimum(rows + 1, len(tick) - 1)
+        rate, latest = rates[rows], tick[rows].astype(np.float64)
+        with np.errstate(divide="ignore"):
+            length = 1.0 / np.abs(rate)
+        gap = np.append(1.0, latest[1:] - tick[rows[1:] - 1])
+        moved = np.diff(counts[rows], prepend=np.nan)
+        pause = np.maximum(tick[behind] - latest, 1.0)
+        return cls(rows, latest, gap, moved, rate, length, rates[behind], pause)
+
+    @property
+    def follows(self) -> npt.NDArray[np.bool_]:
+        """Whether the edge before each was passed in the same direction.
+
+        Else the shaft has turned round since, over an edge that the count does not show. A rate of
+        zero says that the edge was a turn.
+        """
+        turn = np.where(np.abs(self.moved) == 1.0, self.moved, np.nan)
+        direction = np.sign(np.where(self.rate == 0.0, turn, self.rate))
+        return np.append(False, direction[:-1] == np.sign(self.rate[1:]))
+
+    def waits(self) -> tuple[FloatArray, FloatArray]:
+        """How long the last edge was ago, at least and at most, (n,) each."""
+        # Speeding up, the shaft has passed it no longer ago than it would take for the next by now.
+        change = np.diff(self.rate, prepend=self.rate[0])
+        change /= np.diff(self.latest, prepend=self.latest[0] - 1.0)
+        with np.errstate(invalid="ignore"):
+            growth = np.nan_to_num(1.0 + np.sign(self.rate) * change * self.length**2, nan=1.0)
+        growth = np.where(self.slowing() > 0.0, 1.0, np.clip(growth, 1.0, _CREDIBLE))
+        most = np.minimum(self.gap, self.length / growth)
+        # The edge before came in the sample as well, or not, unless the shaft has turned twice.
+        rest = self.gap - self.length
+        within, before = np.abs(self.moved) > 1.0, (np.abs(self.moved) == 1.0) & self.follows
+        most = np.where(within & (rest > 0.0), np.minimum(most, rest), most)
+        return np.where(before & (rest > 0.0) & (rest < most), rest, 0.0), most
+
+    def slowing(self) -> FloatArray:
+        """Part of its speed, 0 to 1, that the shaft loses in each interval by what follows."""
+        loss = (self.rate - self.next_rate) * np.sign(self.rate) / self.pause
+        with np.errstate(invalid="ignore"):
+            return np.clip(np.nan_to_num(loss * self.length**2), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
 class _Intervals:
     """The last interval between edges at each change of the count, times in ticks."""
 
@@ -57,50 +131,44 @@ class _Intervals:
     speed: FloatArray
     begin: FloatArray
     end: FloatArray
-    slack: FloatArray  # by which it may lie earlier or later
+    deviation: FloatArray  # by which it may lie earlier or later
     checked: int  # those whose length and edges can be compared
     agreeing: int  # of them
 
     @classmethod
     def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray) -> _Intervals:
         """rates: in counts per tick."""
-        rows = np.flatnonzero(np.diff(counts, prepend=np.nan))
-        latest = tick[rows].astype(np.float64)  # the last edge was no later than this
-        earliest = np.append(latest[0] - 1.0, tick[rows[1:] - 1])
-        rate = rates[rows]
-        with np.errstate(divide="ignore"):
-            length = 1.0 / np.abs(rate)
-        # The shaft stands anywhere between two edges; how long ago it passed the last depends on
-        # its speed at the sample, which has changed since the interval.
-        change = np.diff(rate, prepend=rate[0]) / np.diff(latest, prepend=latest[0] - 1.0)
-        with np.errstate(invalid="ignore"):
-            growth = np.nan_to_num(1.0 + np.sign(rate) * change * length**2, nan=1.0)
-        growth = np.clip(growth, *_CREDIBLE)
-        slack = 0.5 * np.minimum(latest - earliest, length / growth)
-        end = latest - slack
+        changes = _Changes.of(tick, counts, rates)
+        rate, length, latest = changes.rate, changes.length, changes.latest
+        least, most = changes.waits()
+        wait = _waits_by_silence(tick, rates, changes, most)
+        heard = np.isfinite(wait)
+        low, high = latest - np.where(heard, wait, most), latest - np.where(heard, wait, least)
         # An interval begins with the edge that ended the one before; the first row is no edge.
-        timed = np.flatnonzero(np.isfinite(length) & (length > 1.0 + _OFF_TICK))
-        timed = timed[timed > 1]
-        moved = np.diff(counts[rows], prepend=np.nan)
-        timed = timed[_follow(moved, rate, timed)]
+        timed = np.isfinite(length) & (length > 1.0 + _OFF_TICK) & changes.follows
+        timed[:2] = False
         # Nor may the speed have gone at once since then, as where the shaft turned over and back.
-        kept = np.sign(rates[rows[timed] - 1]) == np.sign(rate[timed - 1])
-        timed = timed[kept | (length[timed] >= _REST)]
-        low = np.maximum(earliest[timed], earliest[timed - 1] + length[timed])
-        high = np.minimum(latest[timed], latest[timed - 1] + length[timed])
-        agreeing = low <= high + _OFF_TICK
-        end[timed[agreeing]] = 0.5 * (low + high)[agreeing]
-        slack[timed[agreeing]] = 0.5 * np.maximum(high - low, 0.0)[agreeing]
-        begin = np.where(rate == 0.0, np.append(earliest[0], end[:-1]), end - length)
+        kept = np.sign(rates[changes.rows - 1]) == np.sign(np.append(0.0, rate[:-1]))
+        timed &= kept | (length >= _REST)
+        low, high, agreeing = _linked(low, high, length, timed)
+        # A speed may be a bound where the last edge may be as long ago as it says.
+        within, lost = length <= changes.gap, changes.slowing()
+        bound = within & (latest - low >= length - _OFF_TICK)
+        turning = within & (np.sign(changes.next_rate) != np.sign(rate)) & (lost > _LOST)
+        end, deviation = _mixed(low, high, latest, length, np.where(bound, lost, 0.0))
+        edges = np.append(latest[0] - 1.0, 0.5 * (low + high)[:-1])
+        begin = np.where(rate == 0.0, edges, end - length)
         # A turn shows as a speed of zero, back over the edge before. Amid several edges nothing
         # tells when that was; nor, where the count goes on, how often the shaft has turned.
+        moved = changes.moved
         back = (np.abs(moved) == 1.0) & (np.diff(moved, prepend=np.nan) == 2.0 * moved)
         # Of one turn after the other nothing tells how fast the shaft passed the edges.
         turns = rate == 0.0
         lasting = ~repeated(turns) | (end - begin >= _REST)
         measured = back & (_faster(rate) < 1.0) & lasting
-        rate = np.where(turns & ~measured, np.nan, rate)
-        return cls(rows, rate, begin, end, slack, len(timed), int(agreeing.sum()))
+        speed = np.where((bound & heard) | turning | (turns & ~measured), np.nan, rate)
+        counted = int(timed.sum()), int(agreeing.sum())
+        return cls(changes.rows, speed, begin, end, deviation, *counted)
 
     def show_edges(self, stated: bool) -> bool:
         """Whether edges made the speeds; stated: somebody says so, and is believed if need be."""
@@ -109,16 +177,63 @@ class _Intervals:
         return self.agreeing >= max(_FEWEST, _SHARE * self.checked)
 
 
-def _follow(moved: FloatArray, rate: FloatArray, rows: IntArray) -> npt.NDArray[np.bool_]:
-    """Whether the last edge of the row before each was passed in the same direction.
+def _waits_by_silence(
+    tick: IntArray, rates: FloatArray, changes: _Changes, most: FloatArray
+) -> FloatArray:
+    """How long each last edge was ago by the bounds shown until the next one, (n,); NaN for most.
 
-    Else the shaft has turned round since, over an edge that the count does not show. moved, rate:
-    (n,) of all rows, in counts; a rate of zero says that the last edge was a turn.
+    most: how long it can have been ago. A device whose speeds are no such bounds tells nothing.
     """
-    turn = np.where(np.abs(moved) == 1.0, moved, np.nan)
-    direction = np.sign(np.where(rate == 0.0, turn, rate))
-    follows: npt.NDArray[np.bool_] = direction[rows - 1] == np.sign(rate[rows])
-    return follows
+    place = np.searchsorted(changes.rows, np.arange(len(tick)), side="right") - 1
+    size, shown = np.abs(rates), changes.rate[place]
+    silent = (place >= 0) & (np.sign(rates) == np.sign(shown)) & (size > 0.0)
+    silent = np.flatnonzero(silent & (size < _LOWER * np.abs(shown)))
+    silent = silent[tick[silent] > changes.latest[place[silent]]]
+    edges, firsts = np.unique(place[silent], return_index=True)
+    silent = silent[firsts]
+    wait = 1.0 / size[silent] - (tick[silent] - changes.latest[edges])
+    possible = (wait > -_OFF_TICK) & (wait < most[edges] + _OFF_TICK)
+    waits = np.full(len(most), np.nan)
+    if possible.sum() >= max(1.0, _SHARE * len(edges)):
+        waits[edges[possible]] = np.clip(wait, 0.0, most[edges])[possible]
+    return waits
+
+
+def _linked(
+    low: FloatArray, high: FloatArray, length: FloatArray, timed: npt.NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+    """Bounds of last edges, (n,) each, that intervals between them narrow, and which fit.
+
+    timed: intervals that begin with the edge before. All of a chain of them shift together.
+    """
+    length = np.where(timed, length, 0.0)
+    begin, end = np.append(low[0], low[:-1]) + length, np.append(high[0], high[:-1]) + length
+    agreeing = timed & (np.maximum(low, begin) <= np.minimum(high, end) + _OFF_TICK)
+    since = np.cumsum(np.where(agreeing, length, 0.0))
+    firsts = np.flatnonzero(~agreeing)
+    chain = np.cumsum(~agreeing) - 1
+    earliest = np.maximum.reduceat(low - since, firsts)[chain] + since
+    latest = np.minimum.reduceat(high - since, firsts)[chain] + since
+    fits = earliest <= latest + _OFF_TICK
+    middle, half = 0.5 * (earliest + latest), 0.5 * np.maximum(latest - earliest, 0.0)
+    return np.where(fits, middle - half, low), np.where(fits, middle + half, high), agreeing
+
+
+def _mixed(
+    low: FloatArray, high: FloatArray, latest: FloatArray, length: FloatArray, share: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and deviation, (n,) each, of the ends of means of which a share are bounds.
+
+    Means over intervals end between low and high, bounds as if they did in the length before the
+    sample, share times as densely; (n,) each.
+    """
+    width, mixed = high - low, share > 0.0
+    length, apart = (
+        np.where(mixed, x, 0.0) for x in (length, latest - 0.5 * (length + low + high))
+    )
+    part = np.divide(share * length, share * length + width, out=np.zeros(len(width)), where=mixed)
+    variance = (width**2 + part * (length**2 - width**2)) / 12.0 + part * (1.0 - part) * apart**2
+    return 0.5 * (low + high) + part * apart, np.sqrt(variance)
 
 
 def repeated(turns: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
@@ -155,13 +270,13 @@ def mean_speeds(
     intervals = _Intervals.of(tick, counts, omega * (dt / count))
     if not intervals.show_edges(by_edges):
         return None
-    rates, begin, end, slack = _at_rows(intervals, tick)
+    rates, begin, end, deviation = _at_rows(intervals, tick)
     windows = np.stack([begin - tick, end - tick], axis=1) * dt
-    return MeanSpeeds(rates * (count / dt), windows, slack * (dt / np.sqrt(3.0)))
+    return MeanSpeeds(rates * (count / dt), windows, deviation * dt)
 
 
 def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, ...]:
-    """Mean rate, begin, end and slack of the interval that each row tells of, (n,) each."""
+    """Mean rate, begin, end and deviation of the interval that each row tells of, (n,) each."""
     n = len(tick)
     before = np.searchsorted(intervals.rows, np.arange(n), side="right") - 1
     after = np.minimum(before + 1, len(intervals.rows) - 1)
@@ -172,10 +287,10 @@ def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, ...]:
     # Longer ago than the interval took, the shaft has slowed down since.
     silent = ~within & (tick - intervals.end[before] > length[before])
     silent &= tick != tick[intervals.rows[before]]
-    last = before == len(intervals.rows) - 1
+    last = (before == len(intervals.rows) - 1) & (tick[-1] - intervals.end[before] >= _REST)
     rate[silent] = np.where(last, 0.0, np.nan)[silent]
     begin[silent] = np.where(last, intervals.end[before], tick)[silent]
     end[silent] = np.where(last, float(tick[-1]), tick)[silent]
     # Rows that tell of the same interval have the same error, and all together count as one.
     _, place, repeated = np.unique(interval, return_inverse=True, return_counts=True)
-    return rate, begin, end, intervals.slack[interval] * np.sqrt(repeated[place])
+    return rate, begin, end, intervals.deviation[interval] * np.sqrt(repeated[place])

@@ -64,7 +64,7 @@ def creeping(t):
 
 @pytest.mark.parametrize(
     ("angle", "error", "at_samples"),
-    [(swinging, 0.008, 0.06), (creeping, 0.003, 0.06), (stopping, 0.001, 0.02)],
+    [(swinging, 0.004, 0.06), (creeping, 2e-4, 0.06), (stopping, 0.001, 0.02)],
 )
 def test_speeds_are_the_means_over_their_windows(angle, error, at_samples):
     tick, theta, omega = logged(angle, 1.2)
@@ -75,6 +75,38 @@ def test_speeds_are_the_means_over_their_windows(angle, error, at_samples):
     # What the log shows is as far as this from the speed at the sample.
     exactly = (angle(tick * DT + 1e-6) - angle(tick * DT - 1e-6)) / 2e-6
     assert np.sqrt(np.mean((omega - exactly) ** 2)) > at_samples
+
+
+def tossed(t):
+    # Turns every few samples, at up to 8 counts a sample.
+    return 0.21 + 0.02 * np.sin(2.0 * np.pi * 37.3 * t) + 0.004 * np.sin(2.0 * np.pi * 61.7 * t)
+
+
+def test_bounds_that_a_counter_shows_before_a_turn_are_not_taken_for_means():
+    """One count over the time since the last edge says nothing of the interval before that edge."""
+    tick, theta, omega = logged(tossed, 3.0)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
+    at, h = tick * DT + speeds.windows.mean(axis=1), 1e-5
+    speed = (tossed(at + h) - tossed(at - h)) / (2.0 * h)
+    slope = (tossed(at + h) - 2.0 * tossed(at) + tossed(at - h)) / h**2
+    ahead = (tossed(at + 2.0 * DT + h) - tossed(at + 2.0 * DT - h)) / (2.0 * h)
+    error = speeds.values - mean_over(tossed, speeds.windows)
+    before = np.isfinite(error) & (slope * speed < 0.0) & (ahead * speed < 0.0) & (tick > 3)
+    assert before.sum() > 200
+    assert abs(np.mean((error * np.sign(speed))[before])) < 0.03  # rad/s
+    late = np.sum((error * slope)[before]) / np.sum(slope[before] ** 2)
+    assert abs(late) < 3e-5  # s
+
+
+@pytest.mark.parametrize("shown", [1.0, 0.9])  # of the bound, by the device in silence
+def test_what_silence_tells_of_the_last_edge_is_believed_if_the_bounds_are_such(shown):
+    tick, theta, omega = logged(creeping, 1.2)
+    silent = (np.diff(theta, prepend=np.nan) == 0.0) & (np.diff(omega, prepend=np.nan) != 0.0)
+    assert silent.sum() > 100
+    omega = np.where(silent, shown * omega, omega)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT)
+    error = speeds.values - mean_over(creeping, speeds.windows)
+    assert np.sqrt(np.nanmean(error**2)) < (2e-4 if shown == 1.0 else 1e-3)
 
 
 def dithering(t):
@@ -110,24 +142,24 @@ def test_a_turn_over_an_edge_and_back_within_a_sample_begins_an_interval(before,
     assert np.isfinite(error[2]) and np.nanmax(error / np.hypot(expected, 0.02)) < 3.0
 
 
-@pytest.mark.parametrize("angle", [swinging, creeping])
+def cornered(t):
+    # The speed goes up and down in straight lines between -1.5 and 1.5 rad/s, 23 times a second.
+    u = (t * 23.0 + 0.13) % 1.0
+    area = np.where(u < 0.5, u * (u - 0.5), (u - 0.5) * (1.0 - u))
+    return 0.21 + 6.0 / 23.0 * area
+
+
+@pytest.mark.parametrize("angle", [swinging, cornered])
 def test_its_jitter_says_how_far_a_mean_may_be_off(angle):
     """Each error in parts of what the jitter makes of the true acceleration is about one."""
     tick, theta, omega = logged(angle, 1.2)
-    speeds = mean_speeds(tick, theta, omega, DT, COUNT)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
     middle = np.clip(tick * DT + speeds.windows.mean(axis=1), 1e-3, 1.2)
     slope = (angle(middle + 1e-5) - 2.0 * angle(middle) + angle(middle - 1e-5)) / 1e-10
     error = speeds.values - mean_over(angle, speeds.windows)
     expected = np.abs(slope) * speeds.jitter
     clear = np.isfinite(error) & (expected > 1e-3)
     assert 0.4 < np.sqrt(np.mean((error[clear] / expected[clear]) ** 2)) < 1.2
-
-
-def cornered(t):
-    # The speed goes up and down in straight lines between -1.5 and 1.5 rad/s, 23 times a second.
-    u = (t * 23.0 + 0.13) % 1.0
-    area = np.where(u < 0.5, u * (u - 0.5), (u - 0.5) * (1.0 - u))
-    return 0.21 + 6.0 / 23.0 * area
 
 
 @pytest.mark.parametrize("angle", [swinging, cornered])
@@ -139,7 +171,7 @@ def test_errors_are_as_large_as_their_variances_say_where_the_speed_has_its_corn
         windows=speeds.windows[:, None], jitter=speeds.jitter[:, None],
     )  # fmt: skip
     error = speeds.values - mean_over(angle, speeds.windows)
-    parts = error / np.sqrt(scatter(record)[:, 0] + 0.003**2)
+    parts = error / np.sqrt(scatter(record)[:, 0] + 0.001**2)
     assert 0.5 < np.sqrt(np.nanmean(parts**2)) < 1.1
     assert np.nanmax(np.abs(parts)) < 5.0
 
