@@ -65,8 +65,9 @@ class Encoder(Section):
     sign: Sign = Field(1, description="-1 turns the direction round")
     speed: Literal["edges", "auto"] = Field(
         "auto",
-        description="what makes omega: edges is the time between the last two counts, as in the "
-        "reference firmware; auto looks whether a log's slow motion shows that; fast logs do not",
+        description="what makes omega: edges is the time between counts, of the last one or of all "
+        "of a sample as in the reference firmware, which the log shows; auto looks whether a log's "
+        "slow motion shows that; fast logs do not",
     )
 
     @property

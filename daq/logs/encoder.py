@@ -1,11 +1,12 @@
 """When an encoder measured the speed that a log shows.
 
 A counter that times its edges tells the speed as one count over the time between the last two of
-them, a mean over an interval that has ended before the sample. Log and calibration tell where it
-lies,
+them, a mean over an interval that has ended before the sample; or, with a capture unit that keeps
+the last alone, as the counts of a sample over the time between its last edge and that of the sample
+before. Which it is shows where the speed changes. Log and calibration tell where the interval lies,
 
-- its length T from the speed, count / |omega|, or, where the shaft has turned round and the speed
-  is zero, from the edges at its ends;
+- its length T from the speed, one count or those of the sample over |omega|, or, where the shaft
+  has turned round and the speed is zero, from the edges at its ends;
 - its end, the last edge, from the sample in which the count has changed, no more than T before its
   end. Of several edges in a sample the one before the last came in it, too, and closer as intervals
   begin where those before them ended.
@@ -18,7 +19,7 @@ it is a bound. In samples without an edge it tells when the last one was. In the
 itself nothing says whether it is a bound or a mean, if the shaft slows down. The part a T^2 / count
 of such speeds is bounds (a deceleration, edges at any phase), means over times T that end between T
 before the sample and the sample: on average where means over intervals end. Before a turn they are
-means of nothing.
+means of nothing. With the counts of a sample there are no bounds but in samples without an edge.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
 _CREDIBLE = 1.5  # growth of the speed within an interval that its neighbour can tell
 _LOST = 0.5  # part of the speed that is lost in an interval before a turn, which tells no mean
 _LOWER = 1.0 - 1e-6  # parts of a speed below which another is lower
+_TINY = 1e-9  # counts a sample, of a shaft that stands
+# Square counts a sample that changes of the speed make of a kind of means; the part that may miss.
+_CLEAR, _ALIKE = 10.0, 0.3
 _FEWEST, _SHARE = 3, 0.8  # of the intervals that can be checked, those that must agree
 # Samples of a mean of zero for which it does not matter when exactly its edges were, nor that none
 # has come yet.
@@ -65,7 +69,7 @@ class _Changes:
 
     latest: time of the sample, the last edge was no later. gap: since the sample before. moved:
     counts, NaN in the first. length: of the interval, infinite for a turn. next_rate, pause: the
-    rate at the sample behind and the time until it.
+    rate at the sample behind and the time until it. whole: intervals are of all counts of a sample.
     """
 
     rows: IntArray  # of the log
@@ -76,6 +80,7 @@ class _Changes:
     length: FloatArray
     next_rate: FloatArray
     pause: FloatArray
+    whole: bool
 
     @classmethod
     def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray) -> _Changes:
@@ -83,12 +88,13 @@ class _Changes:
         rows = np.flatnonzero(np.diff(counts, prepend=np.nan))
         behind = np.minimum(rows + 1, len(tick) - 1)
         rate, latest = rates[rows], tick[rows].astype(np.float64)
-        with np.errstate(divide="ignore"):
-            length = 1.0 / np.abs(rate)
-        gap = np.append(1.0, latest[1:] - tick[rows[1:] - 1])
+        whole = _are_of_whole_samples(tick, counts, rates)
         moved = np.diff(counts[rows], prepend=np.nan)
+        with np.errstate(divide="ignore"):
+            length = (np.abs(moved) if whole else 1.0) / np.abs(rate)
+        gap = np.append(1.0, latest[1:] - tick[rows[1:] - 1])
         pause = np.maximum(tick[behind] - latest, 1.0)
-        return cls(rows, latest, gap, moved, rate, length, rates[behind], pause)
+        return cls(rows, latest, gap, moved, rate, length, rates[behind], pause, whole)
 
     @property
     def follows(self) -> npt.NDArray[np.bool_]:
@@ -103,6 +109,9 @@ class _Changes:
 
     def waits(self) -> tuple[FloatArray, FloatArray]:
         """How long the last edge was ago, at least and at most, (n,) each."""
+        if self.whole:  # the next edge would have come since
+            slower = np.minimum(np.abs(self.rate), self.next_rate * np.sign(self.rate))
+            return np.zeros(len(self.rows)), np.minimum(self.gap, 1.0 / np.maximum(slower, _TINY))
         # Speeding up, the shaft has passed it no longer ago than it would take for the next by now.
         change = np.diff(self.rate, prepend=self.rate[0])
         change /= np.diff(self.latest, prepend=self.latest[0] - 1.0)
@@ -145,16 +154,19 @@ class _Intervals:
         heard = np.isfinite(wait)
         low, high = latest - np.where(heard, wait, most), latest - np.where(heard, wait, least)
         # An interval begins with the edge that ended the one before; the first row is no edge.
-        timed = np.isfinite(length) & (length > 1.0 + _OFF_TICK) & changes.follows
+        timed = np.isfinite(length) & changes.follows
+        timed &= (length > 1.0 + _OFF_TICK) | changes.whole
         timed[:2] = False
         # Nor may the speed have gone at once since then, as where the shaft turned over and back.
         kept = np.sign(rates[changes.rows - 1]) == np.sign(np.append(0.0, rate[:-1]))
         timed &= kept | (length >= _REST)
         low, high, agreeing = _linked(low, high, length, timed)
         # A speed may be a bound where the last edge may be as long ago as it says.
-        within, lost = length <= changes.gap, changes.slowing()
+        within, lost = (length <= changes.gap) & (not changes.whole), changes.slowing()
         bound = within & (latest - low >= length - _OFF_TICK)
         turning = within & (np.sign(changes.next_rate) != np.sign(rate)) & (lost > _LOST)
+        if changes.whole:  # perhaps within the sample, over an edge and back
+            turning = np.append(changes.moved[1:] * changes.moved[:-1] < 0.0, True)
         end, deviation = _mixed(low, high, latest, length, np.where(bound, lost, 0.0))
         edges = np.append(latest[0] - 1.0, 0.5 * (low + high)[:-1])
         begin = np.where(rate == 0.0, edges, end - length)
@@ -175,6 +187,24 @@ class _Intervals:
         if stated and self.checked < _MANY:
             return True
         return self.agreeing >= max(_FEWEST, _SHARE * self.checked)
+
+
+def _are_of_whole_samples(tick: IntArray, counts: FloatArray, rates: FloatArray) -> bool:
+    """Whether speeds are means of all counts of a sample, and not of the last.
+
+    A mean over a sample is behind one over its last interval, by half a sample less half of the
+    interval: so do rates differ from the counts of the sample as the speed changes.
+    """
+    lone = (np.diff(tick)[:-1] == 1) & (np.diff(tick)[1:] == 1)
+    moved, rate = np.diff(counts)[:-1], rates[1:-1]
+    same = (np.sign(rates[:-2]) == np.sign(rate)) & (np.sign(rates[2:]) == np.sign(rate))
+    rows = np.flatnonzero(lone & same & (np.abs(moved) > 1.0) & (rate != 0.0))
+    change = 0.5 * (rates[2:] - rates[:-2])[rows]
+    length = 1.0 / np.abs(rate[rows])
+    of_last, apart = change * (0.5 - length), change * 0.5 * (length - 1.0)
+    beside = (rate - moved)[rows] - of_last
+    square = float(apart @ apart)
+    return abs(float(beside @ apart) - square) < _ALIKE * square and square > _CLEAR
 
 
 def _waits_by_silence(

@@ -39,6 +39,25 @@ def logged(angle, duration):
     return tick, counts[::FINE] * COUNT, omega
 
 
+def logged_by_samples(angle, duration):
+    """The same as a counter shows them whose capture unit keeps the last edge alone."""
+    tick, theta, _ = logged(angle, duration)
+    t = np.arange(len(tick) * FINE) * (DT / FINE)
+    edges = t[np.flatnonzero(np.diff(np.floor(angle(t) / COUNT))) + 1]
+    lasts = np.searchsorted(edges, tick * DT, side="right") - 1
+    moved, omega = np.rint(np.diff(theta, prepend=theta[0]) / COUNT), np.zeros(len(tick))
+    edge, way, rate = -1.0, 0.0, 0.0
+    for k, last in enumerate(lasts):
+        if moved[k]:
+            follows = way == np.sign(moved[k])
+            rate = moved[k] * COUNT / (edges[last] - edge) if follows else 0.0
+            edge, way = edges[last], np.sign(moved[k])
+            omega[k] = rate
+        elif way and k * DT - edge < 0.1:
+            omega[k] = np.sign(rate) * min(abs(rate), COUNT / (k * DT - edge))
+    return tick, theta, omega
+
+
 def mean_over(angle, windows):
     """True mean speeds over windows from the samples on, cut off at the ends of the log."""
     at = np.clip(np.arange(len(windows))[:, None] * DT + windows, 0.0, (len(windows) - 1) * DT)
@@ -190,6 +209,18 @@ def test_fast_motion_that_cannot_show_what_made_its_speeds_has_to_be_told():
     assert turns.sum() > 5 and np.isnan(speeds.values[turns]).all()
     assert np.isnan(speeds.values).mean() < 0.2
     assert np.sqrt(np.nanmean(error**2)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("angle", "error", "measured"),
+    [(swinging, 0.004, 0.99), (tossed, 0.05, 0.6), (shaking, 0.15, 0.7)],
+)
+def test_speeds_that_are_means_of_all_counts_of_a_sample_are_recognised(angle, error, measured):
+    tick, theta, omega = logged_by_samples(angle, 1.2)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
+    errors = speeds.values - mean_over(angle, speeds.windows)
+    assert np.isfinite(errors).mean() > measured
+    assert np.sqrt(np.nanmean(errors**2)) < error
 
 
 @pytest.mark.parametrize("told", [True, False])
