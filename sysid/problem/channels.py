@@ -196,13 +196,16 @@ def spikes(values: FloatArray, inputs: FloatArray, averaged: FloatArray) -> Spik
     at[1:-1] &= (before != 0.0) | (after != 0.0)
     around_it = np.maximum(averaged[:-2], averaged[2:])
     at[1:-1] &= around_it <= np.maximum(_SHORT, _LONGER * averaged[1:-1])
-    jolted = _after_jumps(inputs)
-    reactions = np.abs(away)[jolted[1:-1] & np.isfinite(away)]
-    if len(reactions):
-        # What follows a jump may be as large as what usually follows one.
-        reaction = np.quantile(reactions, 0.9)
-        at[1:-1] &= ~jolted[1:-1] | (np.abs(away) > 3.0 * reaction)
-    at |= _bursts(values, away, 7.0 * max(rough / MEDIAN_OF_NORMAL, resolution(values)), jolted)
+    jolted = _after(_jumps(inputs))
+    for after_jump in jolted.T:
+        reactions = np.abs(away)[after_jump[1:-1] & np.isfinite(away)]
+        if len(reactions):
+            # What follows an input's jump may be as large as what usually follows one of it.
+            reaction = np.quantile(reactions, 0.9)
+            at[1:-1] &= ~after_jump[1:-1] | (np.abs(away) > 3.0 * reaction)
+    noise_at_most = 7.0 * max(rough / MEDIAN_OF_NORMAL, resolution(values))
+    by_any: BoolArray = np.any(jolted, axis=1)
+    at |= _bursts(values, away, noise_at_most, by_any)
     count = int(at.sum())
     if count == 0:
         return None
@@ -234,20 +237,23 @@ def _bursts(values: FloatArray, away: FloatArray, least: float, jolted: BoolArra
     return at
 
 
-def _after_jumps(inputs: FloatArray) -> BoolArray:
-    """Samples at which an input jumps, and the three that follow, (n,)."""
-    return np.convolve(_jumps(inputs), np.ones(4), "full")[: len(inputs)] > 0.5
+def _after(jumps: BoolArray) -> BoolArray:
+    """Samples of jumps (n, n_inputs), and the three that follow each."""
+    after = jumps.copy()
+    for late in (1, 2, 3):
+        after[late:] |= jumps[:-late]
+    return after
 
 
 def _jumps(inputs: FloatArray) -> BoolArray:
-    """Samples at which an input jumps, (n,)."""
-    jumps = np.zeros(len(inputs), dtype=np.bool_)
-    for column in inputs.T:
+    """Samples at which each input jumps, (n, n_inputs)."""
+    jumps = np.zeros(inputs.shape, dtype=np.bool_)
+    for i, column in enumerate(inputs.T):
         steps = np.abs(np.diff(column))
         largest = max(float(steps.max(initial=0.0)), float(np.abs(column[0])))
-        jumps[1:] |= (steps > 0.01 * largest) & (steps > 10.0 * np.median(steps))
+        jumps[1:, i] = (steps > 0.01 * largest) & (steps > 10.0 * np.median(steps))
         # A record that begins under an input begins with its jump.
-        jumps[0] |= abs(column[0]) > 0.01 * largest > 0.0
+        jumps[0, i] = abs(column[0]) > 0.01 * largest > 0.0
     return jumps
 
 
@@ -273,7 +279,7 @@ def standstill(values: FloatArray, inputs: FloatArray) -> Standstill | None:
     least = np.where(resting, 5.0 * usual, max(0.01 * usual, 1.5 * resolution(values)))
     caught = (steps[begins] > least) & (steps[begins + lengths] > 5.0 * usual)
     # What has settled moves with the next jump of an input, and has not slept through another.
-    jumps = np.concatenate([[0], np.cumsum(_jumps(inputs)), [0, 0, 0]])
+    jumps = np.concatenate([[0], np.cumsum(_jumps(inputs).any(axis=1)), [0, 0, 0]])
     ends = begins + lengths
     slept = jumps[ends - 3] > jumps[begins + 4]
     caught &= slept | (jumps[np.minimum(ends + 1, len(values))] == jumps[ends - 3])

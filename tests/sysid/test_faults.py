@@ -327,6 +327,22 @@ def test_outliers_of_a_measured_input_are_named_and_mended():
     assert (note.severity, note.moves_parameters) == ("note", False)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_rare_jumps_of_an_input_do_is_no_outlier_beside_one_that_jumps_often(seed):
+    """As a brake's current, that overshoots, under the levels of a motor."""
+    two = replace(lag(), inputs=(Input("often", "V", "zoh"), Input("rarely", "V", "zoh")),
+                  derivative=lambda x, u, p: ((p[0] * u[1] - x[0]) / p[1],))  # fmt: skip
+    often, rarely = np.sign(levels(seed, length=4)), np.sign(levels(seed + 9, length=40))
+    # The third sample undershoots what the first has overshot.
+    y = lfilter([0.0, 1.2, -0.7, 0.6], [1.0, 0.17, 0.04], rarely)
+    y += 0.03 * np.random.default_rng(seed).standard_normal(N)
+    record = Dataset(np.column_stack([often, rarely]), y, DT, "ringing")
+    assert data_faults(two, [record]) == ()
+    jolted = y + 2.0 * (np.arange(N) == np.flatnonzero(np.diff(often))[30] + 2)
+    (fault,) = data_faults(two, [replace(record, outputs=jolted[:, None])])
+    assert fault.kind == "outliers" and "1 sample" in fault.statement
+
+
 def test_a_short_mean_between_long_ones_is_no_outlier():
     """As of a shaft that slips: four samples repeat the mean from one slow edge to the next."""
     ends = np.cumsum(np.tile([4, 4, 4, 1], N // 13 + 1))
