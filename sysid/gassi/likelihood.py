@@ -41,7 +41,6 @@ from sysid.gassi.optima import (
 )
 from sysid.gassi.slide import slid
 from sysid.problem.earlier_minima import EarlierMinima
-from sysid.uncertainty.estimate import Z95
 
 _ROUNDS = 6  # of weights and parameters in turn
 _NOISE_ROUNDS = 20  # the same of noise, weights and parameters
@@ -57,7 +56,7 @@ _MOVING = 2.0  # deviations that errors of the integration may make on an excerp
 _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _EXPLORED = 2  # minima whose lookalikes are descended from
 _EXPLORED_BY_FILTER = 5  # the same by a filter
-_BETTER = Z95**2  # deviance by which one of them has to be better than the one before
+_BETTER = 1.0  # deviance by which one of them has to be better than the one before
 
 Watch = Callable[[Point], None]
 NoisyInputs = Literal["compensated", "innovations"]
@@ -280,7 +279,8 @@ def _refitted(
     if filters:
         first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
     too_well = _too_well(ranked[0].rms)
-    optima, best, explored = Optima.around(first, objective, too_well), first, None
+    optima, explored = Optima.around(first, objective, too_well), None
+    (first,) = (best,) = optima.ranked()
     for _ in range(_EXPLORED_BY_FILTER if filters else 1):
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break
@@ -290,7 +290,7 @@ def _refitted(
         exact = _exact_among(first, starts) if filters else None
         if exact is not None:
             optima = Optima.around(exact, objective, too_well)
-            first = best = explored = exact
+            (first,) = (best,) = (explored,) = optima.ranked()
         ends = _conceivable(first.objective, starts, optima, best)
         for optimum in _compared(first.objective, ends):
             optima.add(optimum)
@@ -303,8 +303,8 @@ def _refitted(
             else:
                 near = (o for o in others if optima.deviance(o, best) < _CONCEIVABLE)
                 starts = [optimum.chromosome for optimum in near]
-                optima, best = Optima.around(anew, objective, too_well), anew
-                first, explored = anew, None
+                optima, explored = Optima.around(anew, objective, too_well), None
+                (first,) = (best,) = optima.ranked()
     if best is not first:
         optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
     return optima
@@ -344,10 +344,11 @@ def _conceivable(
         if excerpt is not None:
             easier = objective.eased(best.chromosome, _MOVING)
             starts = _conceivable_by(excerpt, easier, starts, optima, best)
+    here = best.by(objective)
     return [
         end
         for end in _quickly(objective, starts, optima.new)
-        if optima.deviance(Optimum.of(objective, end.chromosome, end.rms), best) < _CONCEIVABLE
+        if optima.deviance(Optimum.of(objective, end.chromosome, end.rms), here) < _CONCEIVABLE
     ]
 
 

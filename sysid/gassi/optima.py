@@ -48,10 +48,19 @@ class Optimum:
         finite = np.where(np.isfinite(rms), rms, np.finfo(np.float64).max)
         return cls(objective, chromosome, finite, objective.space.feasible(chromosome))
 
+    def by(self, objective: Objective) -> Self:
+        """With the errors that another objective gives it."""
+        rms = objective.rms(self.chromosome[None])[0]
+        return self.of(self.objective, self.chromosome, rms)
+
 
 def to_compare(objective: Objective) -> Objective:
-    """By which minima far from one another are compared."""
-    return objective.uneased if isinstance(objective, Innovations) else objective
+    """By which minima far from one another are compared.
+
+    All by the same means, whether or not what looks like one of them has asked for exact ones:
+    each would be likelier or less by several than by those of parabolas.
+    """
+    return objective.uneased.exact_means if isinstance(objective, Innovations) else objective
 
 
 def chromosomes_of(optima: Sequence[Optimum]) -> tuple[FloatArray, ...]:
@@ -72,6 +81,7 @@ class Optima:
     @classmethod
     def around(cls, first: Optimum, objective: Objective, too_well: FloatArray) -> Self:
         """One refitted for noisy inputs; too_well: (n_outputs,), by which errors count for less."""
+        first = first.by(to_compare(first.objective))
         optima = cls(objective, first.rms * too_well)
         optima.add(first)
         return optima
@@ -96,9 +106,8 @@ class Optima:
     def refit(self, optimum: Optimum, refitted: Optimum | None) -> None:
         """Put one fitted by its own noise, if it could be, in the place of a minimum."""
         if refitted is not None:
-            rms = to_compare(optimum.objective).rms(refitted.chromosome[None])[0]
             place = [kept is optimum for kept in self._optima].index(True)
-            self._optima[place] = Optimum.of(refitted.objective, refitted.chromosome, rms)
+            self._optima[place] = refitted.by(to_compare(optimum.objective))
 
     def ranked(self) -> list[Optimum]:
         """The likeliest first, feasible before infeasible."""
@@ -121,6 +130,7 @@ class Optima:
         moved in steps, all others are fitted to each.
         """
         objective, coded = optimum.objective, self._objective.space.encode
+        here = optimum.by(objective)
         start, ends = coded(optimum.chromosome), [coded(rival.chromosome) for rival in rivals]
         places = [int(np.argmax(np.abs(end - start) / self._deviations)) for end in ends]
         at, passable = [start] * len(ends), [True] * len(ends)
@@ -139,11 +149,11 @@ class Optima:
                 objective,
                 list(descents.values()),
                 max_iterations=QUICKLY,
-                enough=lambda point: self._alike(point, optimum),
+                enough=lambda point: self._alike(point, here),
             )
             for k, fit in zip(descents, fits, strict=True):
                 reached = Optimum.of(objective, fit.chromosome, fit.rms)
-                passable[k] = self.deviance(reached, optimum) < TOLD_APART
+                passable[k] = self.deviance(reached, here) < TOLD_APART
                 at[k] = coded(fit.chromosome)
         return passable
 
