@@ -220,8 +220,8 @@ def _piped(rows: Iterable[Sequence[str]], words: Sequence[bool]) -> list[str]:
         whole = [" ".join(cell.splitlines()) for cell in cells]
         width = max(map(len, whole))
         columns.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in whole])
-    head, *lines = ("   ".join(row).rstrip() for row in zip(*columns, strict=True))
-    return ["", head, "─" * max(map(len, (head, *lines))), *lines, ""]
+    head, *lines = (" " + "   ".join(row).rstrip() for row in zip(*columns, strict=True))
+    return ["", head, " " + "─" * (max(map(len, (head, *lines))) - 1), *lines, ""]
 
 
 def print_table_of_differences(

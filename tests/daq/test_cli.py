@@ -492,6 +492,30 @@ def test_one_seed_gives_one_result(captured, tmp_path):
     assert values[0] == values[1] != values[2]
 
 
+@pytest.mark.soak
+def test_what_is_said_of_parameters_is_the_same_for_every_seed_of_the_search(tmp_path):
+    """Also where searches end on other sides of a valley, of which one looks like a further set."""
+    assert rig("run", "prbs.yaml", cwd=tmp_path).returncode == 0
+    told = []
+    for seed in (0, 1, 3):
+        words = ("runs", "--seed", seed, "--no-report", "--out", tmp_path / str(seed), "--json")
+        result = rig("identify", *words, cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+        told.append(json.loads(result.stdout)["parameters"])
+    first, *more = told
+    for parameters in more:
+        for name, row in first.items():
+            again = parameters[name]
+            assert again.get("undetermined") == row.get("undetermined"), name
+            ends = [end for end in row.get("interval", ()) if end is not None]
+            if len(ends) == 2:
+                assert again["interval"] == pytest.approx(ends, abs=0.2 * (ends[1] - ends[0]))
+            else:
+                assert len([end for end in again.get("interval", ()) if end is not None]) == len(
+                    ends
+                )
+
+
 # --- Ctrl-C -------------------------------------------------------------------------------
 
 
