@@ -3,38 +3,45 @@
 A second-order lag does not say which of its time constants is the electrical one, and the two may
 change places through parameters of quite different units. So parameters are sought anywhere in the
 ranges whose frequency response, from every input to every output, is that of the minimum: by
-Levenberg and Marquardt from many places at once, which costs no simulation. Parameters that the
-response does not tell apart are left where they are, so that what is found is not merely elsewhere
-in the same valley.
+Levenberg and Marquardt from many places at once, which costs no simulation. Where the response
+leaves parameters tied, what is found is moved along its ties to where it is nearest to the minimum.
+So it is seen whether it is merely elsewhere in the same valley, and found wherever in its valley
+the minimum stands: to trade places parameters may have to leave where chance has put them.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 from sysid.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from sysid.fitting.objective import Objective
 from sysid.response.linearization import linear_models
 
 _STARTS, _ITERATIONS = 32, 25
-_LEFT, _BY_THEN = 10, 6  # starts that go on, and iterations after which those are the nearest
 _FREQUENCIES = 12  # from a period of the record to near half the sample rate
-_DAMPING, _EASED, _STIFFENED = 1e-2, 0.3, 10.0
+_DAMPING, _EASED, _STIFFENED, _STUCK = 1e-2, 0.3, 10.0, 1e3
 _DIFFERENCE = 1e-6
 _ROUNDING = 1e-4  # of the largest, below which a column adds nothing to those before it
 _FLOOR = 0.01  # of a response's peak, below which it hardly matters
 _ALIKE = 0.05  # rms of the difference of two responses in parts of their size
 _APART = 0.03  # of the ranges, within which two places are one
 _MOST = 6
+_SLIDES, _SLIDE = 25, 0.1  # along ties, and parts of the ranges of the first at most
+_CORRECTIONS, _SAME = 3, 1e-3  # after each, and what may be missing then
+_EAGER = 1.5  # by which slides grow that lead on
+_ON_END = 1e-3  # parts of a range
 
 
 def alike_responses(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
     """Chromosomes (n_free,) far from one, and from each other, that answer inputs as it does."""
     responses = _Responses(objective, chromosome)
-    free = responses.independent()
-    if not len(free):
+    moving = responses.moving()
+    if not len(moving):
         return []
-    ends, misses = responses.nearest(free)
+    ends, misses = responses.beside(*responses.nearest(moving), moving)
     kept = [responses.start]
     for i in np.argsort(misses):
         new = all(np.abs((ends[i] - end) / responses.width).max() > _APART for end in kept)
@@ -95,13 +102,65 @@ class _Responses:
         if not len(free):
             return np.zeros((0, count))
         slopes = self._slopes(self.start[None], np.arange(count))[0]
-        sizes = np.linalg.norm(slopes, axis=0)
-        moving = np.flatnonzero(sizes > _ROUNDING * sizes.max(initial=0.0))
-        others = np.setdiff1d(moving, free)
+        others = np.setdiff1d(self.moving(), free)
         directions = np.eye(count)[others]
         directions[:, free] = -np.linalg.lstsq(slopes[:, free], slopes[:, others])[0].T
         directions[np.abs(directions) < _ROUNDING] = 0.0
         return directions * self.width
+
+    def moving(self) -> IntArray:
+        """Places of parameters that move the response."""
+        if not self._reference.size:  # no input varies
+            return np.empty(0, dtype=np.int64)
+        slopes = self._slopes(self.start[None], np.arange(len(self.start)))[0]
+        sizes = np.linalg.norm(slopes, axis=0)
+        return np.flatnonzero(sizes > _ROUNDING * sizes.max(initial=0.0))
+
+    def beside(
+        self, at: FloatArray, misses: FloatArray, moving: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Those that answer alike as far as ties lead towards the start, and what they miss."""
+        alike = misses < _ALIKE
+        at, misses = at[alike], misses[alike]
+        reach, going = np.full(len(at), _SLIDE), np.arange(len(at))
+        for _ in range(_SLIDES):
+            if not len(going):
+                break
+            back, step = self._slide(at[going], moving)
+            longest = np.maximum(np.abs(step).max(axis=1), _ON_END)
+            step *= np.minimum(1.0, reach[going] / longest)[:, None]
+            trial = self._moved(at[going], moving, step)
+            for _ in range(_CORRECTIONS):  # a tie may be curved
+                trial = self._moved(trial, moving, -_times(back, self._miss(trial)))
+            missed = np.sqrt(np.mean(self._miss(trial) ** 2, axis=1))
+            kept = missed < np.maximum(misses[going], _SAME)
+            on = going[kept]
+            at[on], misses[on] = trial[kept], missed[kept]
+            reach[going] *= np.where(kept, _EAGER, _EASED)
+            going = going[(longest > _ON_END) & (reach[going] > _ON_END)]
+        return at, misses
+
+    def _slide(self, at: FloatArray, moving: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Inverses of the slopes, (n, n_moving, m), and steps along ties, (n, n_moving).
+
+        Towards the start, without parameters that would leave their ranges.
+        """
+        slopes, way = self._slopes(at, moving), ((self.start - at) / self.width)[:, moving]
+        ends = np.stack(self.space.coded_bounds)[:, moving]
+        on_end = np.abs(at[:, None, moving] - ends) < _ON_END * self.width[moving]
+        square, inside = np.swapaxes(slopes, 1, 2) @ slopes, np.ones(way.shape, dtype=bool)
+        for _ in range(_CORRECTIONS):
+            both = inside[:, :, None] & inside[:, None]
+            inverse = np.linalg.pinv(square * both, rcond=_ROUNDING**2, hermitian=True)
+            step = inside * way - _times(inverse, _times(square * both, inside * way))
+            inside &= ~(on_end[:, 0] & (step < 0.0)) & ~(on_end[:, 1] & (step > 0.0))
+        return inverse @ np.swapaxes(slopes, 1, 2), step
+
+    def _moved(self, at: FloatArray, places: IntArray, step: FloatArray) -> FloatArray:
+        """Coordinates moved by steps (n, n_places) in parts of the ranges, within these."""
+        moved = at.copy()
+        moved[:, places] += step * self.width[places]
+        return np.clip(moved, *self.space.coded_bounds)
 
     def nearest(self, free: IntArray) -> tuple[FloatArray, FloatArray]:
         """Coordinates (n, n_free) whose responses come nearest, and by how much they miss, (n,)."""
@@ -110,25 +169,27 @@ class _Responses:
         at = np.repeat(self.start[None], _STARTS, axis=0)
         at[:, free] = rng.uniform(lower[free], upper[free], (_STARTS, len(free)))
         miss, damping = self._miss(at), np.full(_STARTS, _DAMPING)
-        slopes = self._slopes(at, free)
-        ends = tuple(bound[free] for bound in self.space.coded_bounds)
-        for k in range(_ITERATIONS):
-            if k == _BY_THEN:
-                nearest = np.argsort(np.sum(miss**2, axis=1))[:_LEFT]
-                at, miss, damping = at[nearest], miss[nearest], damping[nearest]
-                slopes = slopes[nearest]
-            square = np.swapaxes(slopes, 1, 2) @ slopes
+        slopes, going = self._slopes(at, free), np.arange(_STARTS)
+        for _ in range(_ITERATIONS):
+            slope, short = slopes[going], miss[going]
+            square = np.swapaxes(slope, 1, 2) @ slope
             size = np.einsum("nii->ni", square)
-            square += (damping[:, None] * size + 1e-12)[:, :, None] * np.eye(len(free))
-            step = np.linalg.solve(square, -np.swapaxes(slopes, 1, 2) @ miss[:, :, None])[..., 0]
-            trial = at.copy()
-            trial[:, free] = np.clip(at[:, free] + step * self.width[free], *ends)
+            square += (damping[going, None] * size + 1e-12)[:, :, None] * np.eye(len(free))
+            pull = -_times(np.swapaxes(slope, 1, 2), short)
+            step = np.linalg.solve(square, pull[..., None])[..., 0].astype(np.float64)
+            trial = self._moved(at[going], free, step)
             moved = self._miss(trial)
-            better = np.sum(moved**2, axis=1) < np.sum(miss**2, axis=1)
-            at, miss = np.where(better[:, None], trial, at), np.where(better[:, None], moved, miss)
-            damping *= np.where(better, _EASED, _STIFFENED)
-            if better.any():
-                slopes[better] = self._slopes(at[better], free)
+            better = np.sum(moved**2, axis=1) < np.sum(short**2, axis=1)
+            on = going[better]
+            at[on], miss[on] = trial[better], moved[better]
+            damping[going] *= np.where(better, _EASED, _STIFFENED)
+            arrived = np.mean(miss**2, axis=1) < _SAME**2
+            going = np.flatnonzero(~arrived & (damping < _STUCK))
+            on = np.intersect1d(on, going)
+            if len(on):
+                slopes[on] = self._slopes(at[on], free)
+            if not len(going):
+                break
         return at, np.sqrt(np.mean(miss**2, axis=1))
 
     def _slopes(self, at: FloatArray, places: IntArray) -> FloatArray:
@@ -184,3 +245,9 @@ class _Responses:
         ones = (np.broadcast_to(np.eye(k), (*response.shape[:2], k, k)) for k in response.shape[2:])
         left = np.concatenate([outputs, next(ones)], axis=3)
         return response, left, np.concatenate([states, next(ones)], axis=2)
+
+
+def _times(matrices: npt.NDArray[Any], vectors: FloatArray) -> FloatArray:
+    """Each of the matrices (n, a, b) times its vector (n, b)."""
+    product: FloatArray = (matrices @ vectors[..., None])[..., 0]
+    return product

@@ -127,6 +127,40 @@ def test_every_mode_that_sampling_hardly_sees_has_aliases():
         assert np.cos(0.01 * aliases) == pytest.approx(np.cos(0.01 * here[place]), abs=0.02)
 
 
+@pytest.mark.parametrize("resistance", [50.0, 95.0, 190.0])
+def test_what_trades_places_beyond_a_tie_is_found_wherever_on_it_the_minimum_stands(resistance):
+    """A driver of 60 rad/s behind which a coil decays at 500 1/s: gain, R and L act in proportion.
+
+    With the rates swapped R may be 60 at most, for L has an end of its range at 1.
+    """
+
+    def derivative(x, u, p):
+        rate, gain, r, inductance = p
+        return (rate * (u[0] - x[0]), (gain * x[0] - r * x[1]) / inductance)
+
+    model = ProcessModel(
+        name="coil",
+        states=(State("v", "V"), State("i", "A")),
+        inputs=(Input("u", "V"),),
+        outputs=(Output("i", "A"),),
+        parameters=(
+            Parameter("rate", "rad/s", 60.0, 5.0, 1000.0, "log"),
+            Parameter("gain", "1", resistance, 1.0, 1000.0, "log"),
+            Parameter("R", "ohm", resistance, 40.0, 200.0, "log"),
+            Parameter("L", "H", resistance / 500.0, 0.05, 1.0, "log"),
+        ),
+        derivative=derivative,
+    )
+    target = objective_of(model, record_of(model, 1e-3, noise=0.01))
+    starts = np.array(lookalikes(target, model.nominal))
+    swapped = starts[starts[:, 0] > 300.0]
+    assert len(swapped) == 1
+    rate, gain, r, inductance = swapped[0]
+    # The same transfer function: gain rate / ((s + rate) (L s + R)).
+    assert (rate, r / inductance) == pytest.approx((500.0, 60.0), rel=1e-3)
+    assert gain * rate / inductance == pytest.approx(60.0 * 500.0, rel=1e-3)
+
+
 def test_slow_models_have_no_aliases():
     model = oscillator(50.0, 5.0, 500.0)
     here = np.array([50.0, 20.0, 1.0])
