@@ -73,7 +73,7 @@ class Draft:
             return score_tests_of(estimator, training).findings(uncertainty)
 
         free = self._linear and self._linear[0].is_answered
-        if estimator.averaged_inputs_ or not free:
+        if not free:
             return here
         fit = pickle.dumps(problem.request), _without_models((estimator, list(training)))
         begun = self.second.call(_begun, *fit)

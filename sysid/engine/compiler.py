@@ -86,6 +86,7 @@ def kernels(model: ProcessModel, *, exact: bool = True) -> Kernels:
 class Filter:
     """A model's compiled extended Kalman filter."""
 
+    model: ProcessModel
     kernel: FilterKernel
     innovations: Callable[..., None]
 
@@ -97,16 +98,18 @@ def kalman_filter(
     driven: tuple[int, ...] = (),
     averaged: tuple[int, ...] = (),
     coloured: bool = False,
+    moved: tuple[int, ...] = (),
 ) -> Filter:
     """Compile a model's filter for noise on some inputs and states; as ``kernels``.
 
     noisy, driven: their places; averaged: places of outputs, as of ``FilterKernel``, whose model
-    is ``with_integrals`` of them; coloured: whether the inputs' noise may be. Raises ModelError for
-    equations that cannot be differentiated.
+    is ``with_integrals`` of them; coloured: whether the inputs' noise may be; moved: places of
+    parameters, as of ``variation``. Raises ModelError for equations that cannot be differentiated.
     """
-    kernel = FilterKernel(model, variation(model, noisy, driven), averaged, coloured=coloured)
+    varied = variation(model, noisy, driven, moved)
+    kernel = FilterKernel(model, varied, averaged, coloured=coloured)
     text = f"{kernel.structure.program}\n\n{kernel.text()}"
-    return Filter(kernel, *_compiled(model, text, {}, ("innovations",)))
+    return Filter(model, kernel, *_compiled(model, text, {}, ("innovations",)))
 
 
 @dataclass(frozen=True)

@@ -62,22 +62,22 @@ class FilterKernel(BatchKernel):
         self.variation, self.reached = variation, variation.reached
         self.n_noises = len(variation.noisy)
         self.counts["gains"] = len(variation.gains)
-        self._size = len(self.reached) + self.n_noises
+        self.size = len(self.reached) + self.n_noises
         self.n_measured = self.n_outputs - len(averaged)
         # Of one that no noise reaches the free run tells all.
         first = variation.n_states - len(averaged)
         integral = {j: first + m for m, j in enumerate(averaged) if self._gains(j)}
         self.averaged = list(integral)
-        self._integral = {j: self.reached.index(i) for j, i in integral.items()}
-        self._lag = {j: self._size + m for m, j in enumerate(self.averaged)}
+        self.integral = {j: self.reached.index(i) for j, i in integral.items()}
+        self.lag = {j: self.size + m for m, j in enumerate(self.averaged)}
         count = len(self.averaged)
-        self._summed = {j: place + count for j, place in self._lag.items()}
-        self._places = range(self._size + 2 * count)
-        self._pairs = [(a, b) for a in self._places for b in self._places if a <= b]
-        self._covariance = self.work_rows
-        self._noises = self._covariance + len(self._pairs)
-        self._before = self._noises + self.n_noises - self._size
-        self.work_rows = self._noises + self.n_noises + 2 * count
+        self.summed = {j: place + count for j, place in self.lag.items()}
+        self.places = range(self.size + 2 * count)
+        self.pairs = [(a, b) for a in self.places for b in self.places if a <= b]
+        self.covariance = self.work_rows
+        self.noises = self.covariance + len(self.pairs)
+        self.before = self.noises + self.n_noises - self.size
+        self.work_rows = self.noises + self.n_noises + 2 * count
 
     def text(self, *, many_registers: bool = False) -> str:
         """Python text of ``innovations``."""
@@ -87,11 +87,13 @@ class FilterKernel(BatchKernel):
             *[f"v{j} = 0.0" for j in range(self.n_recorded, self.n_inputs)],
             *[f"w{j} = w[k, {j}]" for j in outputs],
             *[f"seen{j} = 1.0 if w{j} > 0.0 else 0.0" for j in outputs],
+            *self._traced("before"),
             *block(EACH_LANE, self._corrected()),
             *block("if k == n_samples - 1:", ["break"]),
             *self._input_slopes(),
             *block(EACH_LANE, self._undisturbed()),
             *block("for step in range(n_steps):", self._stage_inputs(), self._all_lanes(False)),
+            *self._traced("behind"),
             *block(EACH_LANE, self._predicted()),
         ]
         sums = f"sums[j, l] = X[({self._sums} + j) * {LANES} + l]"
@@ -107,9 +109,14 @@ class FilterKernel(BatchKernel):
         ]
         head = (
             "def innovations(X, rows, tables, u, y, w, r, unit, mean, s, colour, intensity, "
-            "spread, corrects, start, p, dt, n_steps, sums, record):"
+            "spread, corrects, start, p, dt, n_steps, sums, record, before, behind):"
         )
         return "\n".join(block(head, body))
+
+    def _traced(self, table: str) -> list[str]:
+        """Keep the first lane's work area, before a sample's outputs or behind its interval."""
+        rows = block(f"for i in range({table}.shape[1]):", [f"{table}[k, i] = X[i * {LANES}]"])
+        return block(f"if k < {table}.shape[0]:", rows)
 
     def _input_slopes(self) -> list[str]:
         rising = (f"i{j} = 1.0 / n_steps" for j in range(self.n_recorded, self.n_inputs))
@@ -118,9 +125,9 @@ class FilterKernel(BatchKernel):
     def _uncertain_start(self) -> list[str]:
         """P before the first sample: ``spread`` of the states, and the noises' variances."""
         n = len(self.reached)
-        variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self._size)}
-        behind = self._places[n:]
-        nothing = [f"{at(self._before + place)} = 0.0" for place in behind]
+        variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self.size)}
+        behind = self.places[n:]
+        nothing = [f"{at(self.before + place)} = 0.0" for place in behind]
         return [*self._stored(variances), *nothing]
 
     def _corrected(self) -> list[str]:
@@ -128,24 +135,24 @@ class FilterKernel(BatchKernel):
         n, lines = len(self.reached), self._outputs()
         if self.output_states is None and self.variation.gains:
             lines += self.call("gains", "g", [at(i) for i in range(self.n_states)], "v")
-        expected = {n + k: at(self._noises + k) for k in range(self.n_noises) if self.coloured}
-        lines += [*self._loaded(), *[f"d{a} = {expected.get(a, 0.0)}" for a in self._places]]
+        expected = {n + k: at(self.noises + k) for k in range(self.n_noises) if self.coloured}
+        lines += [*self._loaded(), *[f"d{a} = {expected.get(a, 0.0)}" for a in self.places]]
         for j in range(self.n_measured):
             lines += self._taken_in(j)
-        begun, kept = self._integral.values(), self._kept_of_outputs()
+        begun, kept = self.integral.values(), self._kept_of_outputs()
         for place, (terms, row) in kept.items():
             lines.append(f"next{place} = {_sum([*terms, *_products(row, 'd{}'.format)])}")
-            for a in self._places:
+            for a in self.places:
                 lines.append(f"L{place}_{a} = {_sum(_products(row, _covariance_with(a)))}")
-        lines += [f"{at(self._before + place)} = next{place}" for place in kept]
+        lines += [f"{at(self.before + place)} = next{place}" for place in kept]
         lines += [
             f"{at(i)} = 0.0" if a in begun else f"{at(i)} += d{a}"
             for a, i in enumerate(self.reached)
         ]
-        lines += [f"{at(self._noises + k)} = d{n + k}" for k in range(self.n_noises)]
-        variances = {(a, b): f"P{a}_{b}" for a, b in self._pairs}
+        lines += [f"{at(self.noises + k)} = d{n + k}" for k in range(self.n_noises)]
+        variances = {(a, b): f"P{a}_{b}" for a, b in self.pairs}
         for place in kept:
-            variances |= {(a, place): f"L{place}_{a}" for a in range(self._size)}
+            variances |= {(a, place): f"L{place}_{a}" for a in range(self.size)}
             for behind, (_, row) in kept.items():
                 if behind >= place:
                     variances[place, behind] = _sum(_products(row, f"L{place}_{{}}".format))
@@ -154,30 +161,30 @@ class FilterKernel(BatchKernel):
 
     def _kept_of_outputs(self) -> dict[int, tuple[list[str], dict[int, str]]]:
         """What the next sample needs of averaged outputs: terms and the row by places in P."""
-        kept = {place: ([f"o{j}"], self._gains(j)) for j, place in self._lag.items()}
-        for j, place in self._summed.items():
+        kept = {place: ([f"o{j}"], self._gains(j)) for j, place in self.lag.items()}
+        for j, place in self.summed.items():
             kept[place] = self._summed_up(j, _OF_SUM)
         return kept
 
     def _summed_up(self, j: int, of: int) -> tuple[list[str], dict[int, str]]:
         """Terms of averaged output j's mean or sum, and the row by places in P."""
-        lag, integral, summed = self._lag[j], self._integral[j], self._summed[j]
+        lag, integral, summed = self.lag[j], self.integral[j], self.summed[j]
         before, now, between, so_far = (f"{name}{of}_{j}" for name in _WEIGHTS)
         row = {b: f"{now} * {c}" if c else now for b, c in self._gains(j).items()}
         row |= {lag: before, integral: between, summed: so_far}
         terms = [
-            f"{before} * {at(self._before + lag)}",
+            f"{before} * {at(self.before + lag)}",
             f"{now} * o{j}",
             f"{between} * {at(self.reached[integral])}",
-            f"{so_far} * {at(self._before + summed)}",
+            f"{so_far} * {at(self.before + summed)}",
         ]
         return terms, row
 
     def _taken_in(self, j: int) -> list[str]:
         """Output j taken in; the deviation d is what the sample's outputs have changed so far."""
-        gains, size, lines = self._gains(j), self._places, []
+        gains, size, lines = self._gains(j), self.places, []
         predicted = [f"o{j}"]
-        if j in self._lag:
+        if j in self.lag:
             lines += [
                 f"{name}{of}_{j} = mean[k, {j}, {of}, {i}]"
                 for of in (_OF_MEAN, _OF_SUM)
@@ -193,7 +200,7 @@ class FilterKernel(BatchKernel):
                 f"gain = seen{j} * corrects / variance",
             ]
             lines += [f"d{a} -= shared{a} * (gain * e)" for a in size]
-            lines += [f"P{a}_{b} -= shared{a} * (gain * shared{b})" for a, b in self._pairs]
+            lines += [f"P{a}_{b} -= shared{a} * (gain * shared{b})" for a, b in self.pairs]
             kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / variance))"
             if self.variation.driven:
                 logarithm = f"seen{j} * math.log(variance / unit[{j}])"
@@ -202,14 +209,16 @@ class FilterKernel(BatchKernel):
 
     def _gains(self, j: int) -> dict[int, str]:
         """Row j of the outputs' Jacobian, by places in P; empty text stands for 1."""
-        model_states = self.variation.n_states
         row: dict[int, str] = {}
         for place, (output, k) in enumerate(self.variation.gains):
             if output == j:
-                behind = len(self.reached) + k - model_states
-                column = self.reached.index(k) if k < model_states else behind
-                row[column] = "" if self.output_states is not None else f"g{place}"
+                row[self.place_of(k)] = "" if self.output_states is not None else f"g{place}"
         return row
+
+    def place_of(self, k: int) -> int:
+        """Place in P of a state, or behind the model's states of a noisy input."""
+        behind = k - self.variation.n_states
+        return self.reached.index(k) if behind < 0 else len(self.reached) + behind
 
     def _undisturbed(self) -> list[str]:
         """Deviations at the start of an interval: each state's column is its own."""
@@ -233,16 +242,16 @@ class FilterKernel(BatchKernel):
         process = self._process()
         for a, i in enumerate(self.reached):
             by_noise = {k: phi[a, n + k] for k in range(self.n_noises) if (a, n + k) in phi}
-            moves = [f"{text} * {at(self._noises + k)}" for k, text in by_noise.items()]
+            moves = [f"{text} * {at(self.noises + k)}" for k, text in by_noise.items()]
             lines += [f"{at(i)} += {_sum(moves)}"] if moves else []
         for a in range(n):
-            row = {c: phi[a, c] for c in range(self._size) if (a, c) in phi}
-            for b in range(self._size):
+            row = {c: phi[a, c] for c in range(self.size) if (a, c) in phi}
+            for b in range(self.size):
                 lines.append(f"M{a}_{b} = {_sum(_products(row, _covariance_with(b)))}")
         variances: dict[_Place, str] = {}
         for a in range(n):
             for b in range(a, n):
-                terms = [f"M{a}_{c} * {phi[b, c]}" for c in range(self._size) if (b, c) in phi]
+                terms = [f"M{a}_{c} * {phi[b, c]}" for c in range(self.size) if (b, c) in phi]
                 terms += [
                     f"{gamma[a, k]} * {gamma[b, k]} * {fresh[k]}"
                     for k in range(self.n_noises)
@@ -258,23 +267,23 @@ class FilterKernel(BatchKernel):
                 terms = [f"{gamma[a, k]} * {fresh[k]}"] if (a, k) in gamma else []
                 terms += [f"colour[{k}] * M{a}_{n + k}"] if self.coloured else []
                 variances[a, n + k] = _sum(terms)
-            for place in self._places[self._size :]:
-                terms = [f"{phi[a, c]} * P{c}_{place}" for c in range(self._size) if (a, c) in phi]
+            for place in self.places[self.size :]:
+                terms = [f"{phi[a, c]} * P{c}_{place}" for c in range(self.size) if (a, c) in phi]
                 variances[a, place] = _sum(terms)
         variances |= {(n + k, n + k): noise for k, noise in fresh.items()}
-        variances |= {(a, b): f"P{a}_{b}" for a, b in self._pairs if a >= self._size}
+        variances |= {(a, b): f"P{a}_{b}" for a, b in self.pairs if a >= self.size}
         if self.coloured:
             variances |= self._going_on(fresh)
-            lines += [f"{at(self._noises + k)} *= colour[{k}]" for k in fresh]
+            lines += [f"{at(self.noises + k)} *= colour[{k}]" for k in fresh]
         return lines + self._stored(variances)
 
     def _going_on(self, fresh: Mapping[int, str]) -> dict[_Place, str]:
         """Covariances of noises of the next sample with one another and with what is kept."""
         n, going = len(self.reached), {}
-        for a, b in self._pairs:
-            if n <= a < self._size:
+        for a, b in self.pairs:
+            if n <= a < self.size:
                 parts = [f"colour[{a - n}]", f"P{a}_{b}"]
-                parts += [f"colour[{b - n}]"] if b < self._size else []
+                parts += [f"colour[{b - n}]"] if b < self.size else []
                 going[a, b] = _sum([" * ".join(parts), *([fresh[a - n]] if a == b else [])])
         return going
 
@@ -310,14 +319,14 @@ class FilterKernel(BatchKernel):
         return entries
 
     def _loaded(self) -> list[str]:
-        return [f"P{a}_{b} = {self._at_pair(a, b)}" for a, b in self._pairs]
+        return [f"P{a}_{b} = {self._at_pair(a, b)}" for a, b in self.pairs]
 
     def _stored(self, variances: Mapping[_Place, str]) -> list[str]:
         """P's upper triangle set, to zero where nothing is given."""
-        return [f"{self._at_pair(*pair)} = {variances.get(pair, '0.0')}" for pair in self._pairs]
+        return [f"{self._at_pair(*pair)} = {variances.get(pair, '0.0')}" for pair in self.pairs]
 
     def _at_pair(self, a: int, b: int) -> str:
-        return at(self._covariance + self._pairs.index((a, b)))
+        return at(self.covariance + self.pairs.index((a, b)))
 
 
 def _covariance_with(a: int) -> Callable[[int], str]:

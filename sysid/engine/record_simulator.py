@@ -8,6 +8,8 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.bends import in_parts, splines_of, with_bends
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
+from sysid.engine.filter_kernel import FilterKernel
+from sysid.engine.filter_response import FilterResponse, filter_response
 from sysid.engine.scheme import LANES, work_area
 from sysid.engine.windows import (
     Ends,
@@ -41,6 +43,7 @@ _PILOT_LEAST = 32  # samples
 # each one's result depends on nothing but itself.
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
 _ALL_LANES = np.arange(LANES)
+_UNTRACED = np.empty((0, 0)), np.empty((0, 0))
 _PARTS = 8  # of a sample, in which a free run tells what averaged outputs are but no parabola
 _AT_ONCE = 1024  # samples of which that many are kept
 _BEFORE = 1e-6  # samples before its first by which a window may begin for the arithmetic's sake
@@ -200,6 +203,7 @@ class RecordSimulator:
         lanes: IntArray,
         n_steps: int,
         values: FloatArray,
+        traces: tuple[FloatArray, FloatArray] = _UNTRACED,
     ) -> tuple[FloatArray, FloatArray]:
         """As ``residuals``, of the innovations of a filter, in parts of the outputs' noise.
 
@@ -210,14 +214,15 @@ class RecordSimulator:
         sample to sample. corrects: whether the filter takes outputs in. exact: whether means are
         what free runs say, of outputs that are no parabolas between samples; beyond: (n_samples,
         n_outputs, n), what these say, where it is known. A state that starts at the first sample
-        of an output has that sample's error. Returns with the sums of squares those of the
-        logarithms of the innovations' variances in parts of the outputs', (n, n_outputs).
+        of an output has that sample's error. traces: filled with the kernel's work area before
+        each sample, (n_samples, work_rows), and behind it, (n_samples, n_states). Returns with the
+        sums of squares those of the logarithms of the innovations' variances in parts of the
+        outputs', (n, n_outputs).
         """
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
         padded = lanes.take(_ALL_LANES, mode="wrap")
         first = [*record.starts_at_samples(model), *[None] * kernel.n_states]
-        weights = self._weights * trust
-        weights[0, [j for j in first if j is not None]] = 0.0
+        (mean, cut), weights = self._taken_in(kernel, trust, corrects)
         variances = noise**2 + scatter
         spread = [0.0 if (j := first[i]) is None else variances[0, j] for i in kernel.reached]
         intensity = process[list(kernel.variation.driven)] ** 2 / record.dt
@@ -227,15 +232,10 @@ class RecordSimulator:
         kept = np.empty((record.n_samples, len(noise), LANES))
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
-        key = tuple(kernel.averaged), corrects
-        if key not in self._means_of:  # the same in every run of a fit
-            self._means_of[key] = self._means(*key)
-        mean, cut = self._means_of[key]
         inputs = self._inputs_of.get(tuple(kernel.splines))
         if inputs is None:  # likewise
             inputs = with_bends(model, record, kernel.splines)
             self._inputs_of[tuple(kernel.splines)] = inputs
-        weights[0, [j for j in self.averaged if j not in cut]] = 0.0  # its mean is not over yet
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
         if beyond is not None:
             measured[..., : len(lanes)] -= beyond
@@ -246,11 +246,57 @@ class RecordSimulator:
                 work, work.reshape(-1, LANES), kernel.tables, inputs, measured, weights,
                 variances, noise**2, mean, of_inputs, colour[list(kernel.variation.noisy)],
                 intensity, np.array(spread), float(corrects), start,
-                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept,
+                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept, *traces,
             )  # fmt: skip
         values[..., _neighbours(lanes)] = kept[..., : len(lanes)]
         sse, logarithms = (half.T[: len(lanes)] for half in np.split(sums, 2))
         return sse, logarithms
+
+    def _taken_in(
+        self, kernel: FilterKernel, trust: FloatArray, corrects: bool
+    ) -> tuple[_Means, FloatArray]:
+        """As of ``_means``, and weights (n_samples, n_outputs) of what a filter takes in."""
+        key = tuple(kernel.averaged), corrects
+        if key not in self._means_of:  # the same in every run of a fit
+            self._means_of[key] = self._means(*key)
+        means, weights = self._means_of[key], self._weights * trust
+        starting = [j for j in self.record.starts_at_samples(self.kernels.model) if j is not None]
+        over = [j for j in self.averaged if j not in means[1]]
+        weights[0, starting + over] = 0.0  # of the latter no mean is over yet
+        return means, weights
+
+    def filter_response(
+        self,
+        kalman: Filter,
+        noise: FloatArray,
+        scatter: FloatArray,
+        trust: FloatArray,
+        process: FloatArray,
+        colour: FloatArray,
+        corrects: bool,
+        exact: bool,
+        beyond: FloatArray | None,
+        vector: FloatArray,
+        start: FloatArray,
+        n_steps: int,
+    ) -> FilterResponse:
+        """How innovations answer disturbances under parameters (n_parameters,) from a start.
+
+        kalman: with every state driven. Other arguments as of ``innovations``.
+        """
+        kernel, n = kalman.kernel, self.record.n_samples
+        before, behind = np.zeros((n, kernel.work_rows)), np.zeros((n, kernel.n_states))
+        values = np.empty((n, len(noise), 1))
+        self.innovations(
+            kalman, noise, scatter, trust, process, colour, corrects, exact, beyond,
+            vector[None], start[None], np.zeros(1, dtype=np.int64), n_steps, values,
+            (before, behind),
+        )  # fmt: skip
+        (mean, _), weights = self._taken_in(kernel, trust, corrects)
+        return filter_response(
+            kalman.model, kernel, before, behind, mean, weights, noise**2 + scatter, noise**2,
+            colour[list(kernel.variation.noisy)], corrects, self.record.inputs, vector,
+        )  # fmt: skip
 
     def tangents(
         self, tangents: Tangents, parameters: FloatArray, starts: FloatArray, n_steps: int

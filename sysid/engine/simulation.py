@@ -10,7 +10,8 @@ import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.bends import bent
-from sysid.engine.compiler import kalman_filter, kernels, tangents
+from sysid.engine.compiler import Filter, kalman_filter, kernels, tangents
+from sysid.engine.filter_response import FilterResponse
 from sysid.engine.record_simulator import RecordSimulator, blocks_of
 from sysid.engine.scheme import LANES
 from sysid.engine.windows import with_integrals
@@ -242,13 +243,9 @@ class BatchSimulator:
         """
         process = np.zeros(len(self.model.states)) if process is None else process
         driven = tuple(np.flatnonzero(process).tolist())
-        averaged = tuple(sorted({j for record in records for j in self._on(record).averaged}))
-        model = bent(self.model) if all(record.between.size for record in records) else self.model
-        model = with_integrals(model, averaged) if averaged else model
         white = np.zeros((len(records), len(self.model.inputs)))
         colours = white if colour is None else np.asarray(colour)
-        coloured = bool(colours.any())
-        kalman = kalman_filter(model, noisy_inputs(records), driven, averaged, coloured)
+        kalman = self._filter(records, driven, bool(colours.any()))
         logarithms = np.zeros((len(parameters), len(records), len(noise)))
         if scatter is None:
             scatter = [np.zeros(record.outputs.shape) for record in records]
@@ -278,6 +275,49 @@ class BatchSimulator:
             values=innovations.values * factor.T,
             sse=innovations.sse * factor[:, None] ** 2,
         )
+
+    def filter_response(
+        self,
+        vector: FloatArray,
+        record: Dataset,
+        scale: FloatArray,
+        n_steps: int,
+        start: FloatArray,
+        noise: FloatArray,
+        *,
+        scatter: FloatArray,
+        trust: FloatArray,
+        process: FloatArray,
+        colour: FloatArray,
+        corrects: bool,
+        exact: bool,
+        beyond: FloatArray | None,
+    ) -> FilterResponse:
+        """How innovations of a record answer what is added to the equations and the outputs.
+
+        Of one parameter vector, (n_parameters,), from one start, (n_states,). Other arguments as of
+        ``innovations``, for one record.
+        """
+        states, moved = (
+            tuple(range(len(part))) for part in (self.model.states, self.model.parameters)
+        )
+        kalman = self._filter([record], states, bool(colour.any()), moved)
+        return self._on(record, scale).filter_response(
+            kalman, noise, scatter, trust, process, colour, corrects, exact, beyond, vector, start,
+            n_steps,
+        )  # fmt: skip
+
+    def _filter(
+        self,
+        records: Sequence[Dataset],
+        driven: tuple[int, ...],
+        coloured: bool,
+        moved: tuple[int, ...] = (),
+    ) -> Filter:
+        averaged = tuple(sorted({j for record in records for j in self._on(record).averaged}))
+        model = bent(self.model) if all(record.between.size for record in records) else self.model
+        model = with_integrals(model, averaged) if averaged else model
+        return kalman_filter(model, noisy_inputs(records), driven, averaged, coloured, moved)
 
     def beyond_parabolas(
         self,

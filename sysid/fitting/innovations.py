@@ -35,6 +35,7 @@ from typing import Any, Self
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.engine.filter_response import FilterResponse
 from sysid.engine.simulation import BatchResult, Residuals, Status
 from sysid.fitting.averages import coloured, denoised
 from sysid.fitting.means import each_mean_once, scatter
@@ -289,11 +290,7 @@ class Innovations(Objective):
 
     def _noise_of_each(self) -> FloatArray:
         """Noise of the outputs in the units of residuals, (n_residuals, n_outputs)."""
-        parts = [
-            np.broadcast_to(self.noise / scale, record.outputs.shape)
-            for scale, record in zip(self.scales, self.records, strict=True)
-        ]
-        return np.concatenate(parts)
+        return self.noise / self.scales_of_each
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """As ``Objective.steps_needed``, of which a filter that corrects needs a part."""
@@ -373,6 +370,9 @@ class Innovations(Objective):
             colours = [self.colour[place] for place in places]
             scatters = [scatter(record) for record in records]
             vars(part).update(colour=colours, scatter=scatters, trust=_full(records))
+        else:
+            lengths = [record.n_samples for record in records]
+            vars(part).update(scatter=_cut(self.scatter, lengths), trust=_cut(self.trust, lengths))
         return part
 
     def of_record(self, place: int, record: Dataset) -> Objective:
@@ -466,6 +466,15 @@ class Innovations(Objective):
         ends = np.cumsum([record.n_samples for record in self.records])[:-1]
         return self._with(trust=np.split(1.0 / np.sqrt(1.0 + variances), ends))
 
+    def bends(self, chromosome: FloatArray) -> FloatArray:
+        """What draws of noise do to residuals but in proportion, at (n_free,).
+
+        (n_draws, n_residuals, n_outputs), in the units of residuals.
+        """
+        bends = self._bends(chromosome) * self._noise_of_each() * np.concatenate(self.trust)
+        finite: FloatArray = np.where(np.isfinite(bends), bends, 0.0)
+        return finite
+
     def _bends(self, chromosome: FloatArray) -> FloatArray:
         """What noise does to innovations but in proportion, (n_draws, n_residuals, n_outputs).
 
@@ -504,6 +513,28 @@ class Innovations(Objective):
         np.divide(scaled, free_run, out=share, where=free_run != 0.0)
         return share
 
+    def response(self, chromosome: FloatArray, place: int, n_steps: int) -> FilterResponse:
+        """How innovations of the record at a place answer disturbances, at (n_free,).
+
+        Changes are in parts of the outputs' scales.
+        """
+        shape = None if self.shape is None else self.shape.of(self.space.encode(chromosome)[None])
+        return self.simulator.filter_response(
+            self.space.full(chromosome[None])[0],
+            self.records[place],
+            self.scales[place],
+            n_steps,
+            self._starts(chromosome[None])[place][0],
+            self.noise,
+            scatter=self.scatter[place],
+            trust=self.trust[place],
+            process=self.process,
+            colour=self.colour[place],
+            corrects=self.corrects,
+            exact=self.exact,
+            beyond=None if shape is None else shape[place],
+        )
+
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
         """As ``Objective.evaluate``, at the integration steps that the free runs need."""
         steps = self.steps_needed(chromosomes)
@@ -534,6 +565,11 @@ class Innovations(Objective):
             beyond=None if self.shape is None else self.shape.of(self.space.encode(chromosomes)),
             balanced=balanced,
         )
+
+
+def _cut(tables: Sequence[FloatArray], lengths: Sequence[int]) -> list[FloatArray]:
+    """The first tables, each from its begin as long as that."""
+    return [table[:length] for table, length in zip(tables, lengths, strict=False)]
 
 
 def _full(records: Sequence[Dataset]) -> list[FloatArray]:

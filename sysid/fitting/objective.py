@@ -130,6 +130,12 @@ class Objective:
         return self._with(records=list(records), counts=counts, scales=scales)
 
     @property
+    def scales_of_each(self) -> FloatArray:
+        """Unit of each residual, (n_residuals, n_outputs)."""
+        parts = zip(self.scales, self.records, strict=True)
+        return np.concatenate([np.broadcast_to(s, record.outputs.shape) for s, record in parts])
+
+    @property
     def coupled(self) -> bool:
         """Whether residuals of a record depend on the others."""
         return False

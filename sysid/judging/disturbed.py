@@ -19,6 +19,7 @@ from sysid.engine.trace import rates_along
 from sysid.engine.windows import average, with_integrals
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ModelError, ProcessModel
+from sysid.problem.preparation import at_places
 from sysid.threads import Workers
 
 _ACCURACY = 1e-6
@@ -110,6 +111,24 @@ class DisturbedRun:
         self.rates = self.rates_of(self.model.derivative, self.vector)
         self._rate_size = np.sqrt(np.mean(self.rates**2, axis=0))
 
+    @property
+    def colour(self) -> FloatArray:
+        """Part of the inputs' noise that goes on from sample to sample, (n_inputs,): none."""
+        return np.zeros(self.record.inputs.shape[1])
+
+    @property
+    def instants(self) -> FloatArray:
+        """The undisturbed outputs as ``averaged`` takes them, (n_samples, n_outputs)."""
+        return self.outputs
+
+    def averaged(self, j: int, signal: FloatArray) -> FloatArray:
+        """A change (n_samples,) of output j as its sensor shows it: of what that has averaged."""
+        return signal
+
+    def late(self, j: int, delay: float) -> FloatArray:
+        """Change (n_samples,) of output j by so many seconds that it comes late."""
+        return shifted(self.outputs[:, j], -delay / self.record.dt, False)
+
     def over(self, windows: FloatArray) -> FloatArray:
         """The undisturbed outputs over other windows, (n_samples, n_outputs, 2)."""
         return self._as_measured(self._whole_run, windows)
@@ -138,6 +157,10 @@ class DisturbedRun:
             return np.zeros_like(self.outputs)
         eps = _SMALL * (float(given[changed].max()) or 1.0) / size
         return self._change(self.record.inputs + eps * inputs, 0.0, eps)
+
+    def logged(self, outputs: FloatArray) -> FloatArray:
+        """Change by what is logged of the outputs beside what they are: that itself."""
+        return outputs
 
     def started(self, place: int) -> FloatArray:
         """Change of the outputs per unit of where a state starts, (n_samples, n_outputs)."""
@@ -173,6 +196,12 @@ class DisturbedRun:
             within = windows[:, j] / self.record.dt
             outputs[:, j] = average(outputs[:, [j]], integral[:, None], within)[:, 0]
         return outputs
+
+
+def shifted(signal: FloatArray, samples: float, held: bool) -> FloatArray:
+    """Change of a signal that is taken so many samples later."""
+    places = np.clip(np.arange(len(signal)) + samples, 0.0, len(signal) - 1.0)
+    return at_places(signal, places, held) - signal
 
 
 def of_each(

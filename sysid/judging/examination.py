@@ -3,8 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import AccurateRun
+from sysid.fitting.innovations import MISJUDGED
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi import GASSI, PRESETS
@@ -106,7 +109,8 @@ def suspected(
 ) -> Suspicion | None:
     """What the model may lack by the training records; None where that cannot be tested.
 
-    By free runs, and not where noise of the inputs moves these so far that a filter averages it.
+    By free runs, or innovations where noise of the inputs moves these so far that a filter averages
+    it; not where equations bend over what is left of it, since a filter does not see that.
     validation: on which a variant that is fitted must do no worse. missing: the findings of
     ``score_tests_of``, where these have been begun elsewhere.
     """
@@ -115,7 +119,7 @@ def suspected(
     exchange = exchanged_channels(estimator, uncertainty, training)
     if exchange is not None:
         return Suspicion((exchange,), None)  # what else is found is of the wrong channels
-    if estimator.averaged_inputs_:
+    if estimator.averaged_inputs_ and np.any(uncertainty.bent > MISJUDGED):
         return None
     try:
         if any(p.pushed for p in uncertainty.parameters):
@@ -140,7 +144,9 @@ def score_tests_of(estimator: GASSI, training: Sequence[Dataset]) -> ScoreTests:
 
     Raises ModelError for equations that cannot be added to, and a run that fails.
     """
-    return ScoreTests(estimator.final_free_run(list(training)), estimator.final_chromosome_)
+    averaged = estimator.averaged_inputs_
+    final = estimator.final_objective if averaged else estimator.final_free_run
+    return ScoreTests(final(list(training)), estimator.final_chromosome_)
 
 
 def _freed(objective: Objective, chromosome: FloatArray) -> tuple[Objective, FloatArray]:

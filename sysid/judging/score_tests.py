@@ -16,17 +16,17 @@ probability is taken into the regression, and the rest asked again.
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import noiseless
-from sysid.fitting.means import scatter
+from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
+from sysid.judging.background import Background, of_filter, of_free_runs
 from sysid.judging.cycles import cycle_suspects
-from sysid.judging.disturbed import DisturbedRun, of_each
 from sysid.judging.findings import Finding, moves_of
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
@@ -39,34 +39,27 @@ from sysid.judging.suspects import (
     function_suspects,
     head,
     in_single_records,
-    likely_noise,
     variant_suspects,
 )
 from sysid.judging.whitener import Whitener
 from sysid.problem.terms import AddedTerm
 from sysid.threads import Workers
 from sysid.uncertainty import Estimate, Uncertainty
-from sysid.uncertainty.colour import record_rows
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
-    input_noises,
     sensitivity,
     spans,
-    zero_errors,
 )
 from sysid.uncertainty.ties import free_gradient, named_values
 
 _CHANCE = 1e-3  # probability of a finding by chance, all tests together
 _SEVERAL = ("variant", "bend", "function", "curve", "disturbance")  # have no single amplitude
+_SLOW = ("delay", "filter", "lag")
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
 _LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
-_TINY = 1e-300
-_ITERATIONS = 20  # by which residuals' variances settle
-_COMMON = 0.15  # of the windows' jitter, that they may all lie too early or too late
 _FEW = 25  # samples for each amplitude, below which what they leave tells no colour
-_INEXACT = 1e-2  # of the residuals' deviation, from where a simulation's error shows in them
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
 _REACH = 10.0  # of a term's range in parts of the size that its test found
 # Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
@@ -88,26 +81,27 @@ def missing_physics(
 class ScoreTests:
     """Tests at a minimum, (n_free,), with all that they take but the parameters' intervals.
 
-    objective: of the free run's errors, or whose ``free_run`` is. Raises ModelError where the free
-    run fails.
+    objective: of the free run's errors, or whose ``free_run`` is; where a filter averages its
+    inputs, of innovations. Raises ModelError where the free run fails.
     """
 
     def __init__(self, objective: Objective, chromosome: FloatArray) -> None:
         records = head(objective.records, _MOST_SAMPLES)
-        local = sensitivity(objective.free_run.on(records), chromosome)
+        filtered = isinstance(objective, Innovations) and objective.quiet
+        tested = objective if filtered else objective.free_run
+        local = sensitivity(tested.on(records), chromosome)
         left = np.sqrt(np.mean(local.residual**2, axis=0))
-        self._exact = noiseless(local.objective, chromosome, left)
+        self._exact = not filtered and noiseless(local.objective, chromosome, left)
         if self._exact:
             return
-        self._runs = runs = _runs(local)
+        local, runs, background = (of_filter if filtered else of_free_runs)(local)
+        self._runs, self._tests = runs, _Tests(local, background, runs[0].workers)
         noisy = [runs[0].model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
         channels = list(channel_suspects(runs))
         # Noise of an input makes its gain look smaller, and play takes it off: that is no fault.
-        channels = [s for s in channels if s.kind not in ("gain", "play") or s.name not in noisy]
-        foreseen = np.concatenate([_foreseen_noise(runs), _simulation_error(runs, local)], axis=2)
-        foreseen = foreseen[..., foreseen.any(axis=(0, 1))]
-        chance = np.concatenate([_noisy_starts(runs, local), _moved_windows(runs)], axis=2)
-        self._tests = _Tests(local, foreseen, chance, _weights(runs, local), runs[0].workers)
+        # Of averages the noise left is as slow as what a delay changes in them.
+        of_noise = ("gain", "play", *(_SLOW if filtered else ()))
+        channels = [s for s in channels if s.kind not in of_noise or s.name not in noisy]
         channels += in_single_records([s for s in channels if s.kind != "noise"], runs)
         self._named = [*channels, *variant_suspects(runs)]
 
@@ -132,109 +126,6 @@ class ScoreTests:
         return tests.settled()
 
 
-def _runs(local: Sensitivity) -> list[DisturbedRun]:
-    objective, chromosomes = local.objective, local.chromosome[None]
-    model, vector = objective.simulator.model, objective.space.full(chromosomes)[0]
-    workers, runs = Workers(objective.simulator.threads), []
-    for k, record in enumerate(objective.records):
-        start = objective.space.starts(chromosomes, k, record.initial_state(model))[0]
-        runs.append(DisturbedRun(model, vector, record, start, workers))
-    return runs
-
-
-def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
-    """What the noise of inputs is likely to have done to the outputs, (n_rows, n_outputs, k).
-
-    Given what was measured, noise is not zero in the mean: a Wiener filter tells what of an input
-    it probably is. Uncorrelated with any linear function of what was measured is only the rest.
-    """
-    records = [run.record for run in runs]
-    columns = []
-    noisy = np.any([record.input_noise for record in records], axis=0)
-    for i in np.flatnonzero(noisy).tolist():
-        columns.append(of_each(runs, partial(_likely_noise, i)))
-    n = sum(record.n_samples for record in records)
-    return np.stack(columns, axis=2) if columns else np.zeros((n, runs[0].outputs.shape[1], 0))
-
-
-def _likely_noise(i: int, run: DisturbedRun) -> FloatArray:
-    """What the noise of input i is likely to have done to the outputs, (n_samples, n_outputs)."""
-    part = np.zeros(run.record.inputs.shape)
-    part[:, i] = likely_noise(run.record.inputs[:, i], float(run.record.input_noise[i]))
-    return run.driven(part)
-
-
-def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
-    """What a finer integration changes in the outputs, (n_rows, n_outputs, 1); none if little."""
-    pieces = []
-    for run, rows, scale in zip(
-        runs, record_rows(local.lengths), local.objective.scales, strict=True
-    ):
-        left = local.residual[rows] * scale
-        coarse = np.where(local.seen[rows], run.record.outputs + left, run.outputs)
-        pieces.append(run.outputs - coarse)
-    error = np.concatenate(pieces)[..., None]
-    size = np.sqrt(np.mean(error[..., 0] ** 2, axis=0))
-    left = np.sqrt(np.mean(local.residual**2, axis=0)) * np.mean(local.objective.scales, axis=0)
-    return error if np.any(size > _INEXACT * left) else error[..., :0]
-
-
-def _noisy_starts(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
-    """Changes (n_rows, n_outputs, k) by one noise of each first sample at which a run starts."""
-    lengths = tuple(run.record.n_samples for run in runs)
-    columns = [np.zeros((sum(lengths), runs[0].outputs.shape[1], 0))]
-    places = zip(runs, record_rows(lengths), local.objective.scales, strict=True)
-    for run, rows, scale in places:
-        left = local.residual[rows] * scale
-        for place, j in enumerate(run.record.starts_at_samples(run.model)):
-            if j is not None:
-                column = np.zeros((*columns[0].shape[:2], 1))
-                deviation = run.record.sample_noise(j, left[:, j])
-                column[rows, :, 0] = deviation * run.started(place)
-                columns.append(column)
-    return np.concatenate(columns, axis=2)
-
-
-def _moved_windows(runs: Sequence[DisturbedRun]) -> FloatArray:
-    """Change (n_rows, n_outputs, 1) by what all windows may lie too early.
-
-    That each is known to within its jitter does not say that they are right in the mean.
-    """
-    if not any(run.record.jitter.any() for run in runs):
-        return np.zeros((sum(run.record.n_samples for run in runs), runs[0].outputs.shape[1], 0))
-
-    def later(run: DisturbedRun) -> FloatArray:
-        if not run.record.jitter.size:
-            return np.zeros_like(run.outputs)
-        return run.over(run.record.windows + _COMMON * run.record.jitter[..., None]) - run.outputs
-
-    return of_each(runs, later)[..., None]
-
-
-def _weights(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
-    """What each residual counts, (n_rows, n_outputs), by its deviation in parts of the smallest.
-
-    Of a mean over a time that is not well known the deviation is larger where the output changes
-    fast (``scatter``). As regressions weigh all alike, a few such means would decide.
-    """
-
-    def scattered(run: DisturbedRun) -> FloatArray:
-        return scatter(run.record, lambda record: run.over(record.windows))
-
-    pairs = zip(runs, local.objective.scales, strict=True)
-    scattering = np.concatenate([scattered(run) / scale**2 for run, scale in pairs])
-    if not scattering.any():
-        return np.ones(local.residual.shape)
-    squares = np.where(local.seen, local.residual**2, 0.0)
-    counts = np.maximum(local.seen.sum(axis=0), 1)
-    common = np.maximum(squares.sum(axis=0) / counts, _TINY)
-    for _ in range(_ITERATIONS):  # until squares are what variances say
-        share = np.sum(squares / (common + scattering), axis=0) / counts
-        common = np.maximum(common * share, _TINY)
-    weights: FloatArray = np.sqrt(common / (common + scattering))
-    return weights
-
-
 class _Tests:
     """Regression of residuals, to which suspects are admitted one after another.
 
@@ -246,43 +137,28 @@ class _Tests:
     _estimates: list[Estimate]
     _gradients: FloatArray
 
-    def __init__(
-        self,
-        local: Sensitivity,
-        foreseen: FloatArray,
-        chance: FloatArray,
-        weights: FloatArray,
-        workers: Workers,
-    ) -> None:
-        """Of changes that are there whatever is missing, (n_residuals, n_outputs, k) each.
-
-        foreseen: of any size. chance: by one standard deviation of what is known to be so large.
-        weights: (n_residuals, n_outputs), as of ``_weights``.
-        """
+    def __init__(self, local: Sensitivity, background: Background, workers: Workers) -> None:
         self._workers = workers
+        weights = background.weights
         self._local, self._residual = local, -local.residual * weights
-        self._scales = np.concatenate(
-            [
-                np.broadcast_to(scale, (n, len(scale)))
-                for scale, n in zip(local.objective.scales, local.lengths, strict=True)
-            ]
+        self._scales = local.objective.scales_of_each / weights
+        foreseen, chance = (
+            part / self._scales[..., None] for part in (background.foreseen, background.chance)
         )
-        self._scales = self._scales / weights
-        zeros = [(zero * weights)[..., None] for zero in zero_errors(local)]
-        foreseen, chance = (part / self._scales[..., None] for part in (foreseen, chance))
-        slopes = local.slopes * weights[..., None]
-        self._columns = np.concatenate([slopes, *zeros, chance, foreseen], axis=2)
+        self._columns = np.concatenate(
+            [local.slopes * weights[..., None], chance, foreseen], axis=2
+        )
         on_bound = local.objective.space.on_bound(local.chromosome)
         freedom = np.where(on_bound, _UNBOUND, _FREEDOM)
         self._free = np.concatenate(
             [
                 1.0 / (freedom * spans(local.objective, local.chromosome)),
-                np.ones(len(zeros) + chance.shape[2]),
+                np.ones(chance.shape[2]),
                 np.zeros(foreseen.shape[2]),
             ]
         )
         self._noises = [
-            (rows, noise * weights[rows][..., None]) for rows, noise in input_noises(local)
+            (rows, noise * weights[rows][..., None]) for rows, noise in background.noises
         ]
         self._regression = self._coloured_by(self._residual)
 

@@ -13,12 +13,11 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.judging.disturbed import DisturbedRun, of_each
+from sysid.judging.disturbed import DisturbedRun, of_each, shifted
 from sysid.linear.polynomials import all_pole
 from sysid.problem.channels import noise
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ProcessModel, State
-from sysid.problem.preparation import at_places
 from sysid.problem.terms import AddedTerm, Shape
 
 Kind = Literal[
@@ -108,8 +107,8 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         yield from _late("filter", output.name, partial(_filtered_output, runs, j), runs)
         zeroed = any(run.record.output_zero[j] for run in runs)
         for kind, signal in _faults(partial(_output, j), zeroed):
-            changes = np.concatenate([_column(run.outputs, j, signal(run)) for run in runs])
-            yield Suspect(kind, output.name, _unit(kind, output.unit), changes[..., None])
+            changes = _logged(runs, j, signal)[..., None]
+            yield Suspect(kind, output.name, _unit(kind, output.unit), changes)
     for i, given in enumerate(model.inputs):
         if not any(np.any(run.record.inputs[:, i]) for run in runs):
             continue
@@ -139,18 +138,21 @@ def _late(
 
 
 def _late_output(runs: Sequence[DisturbedRun], j: int, delay: float) -> FloatArray:
-    def late(run: DisturbedRun) -> FloatArray:
-        shifted = _shifted(run.outputs[:, j], -delay / run.record.dt, False)
-        return _column(run.outputs, j, shifted)
-
-    return of_each(runs, late)[..., None]
+    return _logged(runs, j, lambda run: run.late(j, delay))[..., None]
 
 
 def _filtered_output(runs: Sequence[DisturbedRun], j: int, time: float) -> FloatArray:
-    parts = [
-        _column(run.outputs, j, _smoothed(run.outputs[:, j], time / run.record.dt)) for run in runs
-    ]
-    return np.concatenate(parts)[..., None]
+    def change(run: DisturbedRun) -> FloatArray:
+        return run.averaged(j, smoothed(run.instants[:, j], time / run.record.dt))
+
+    return _logged(runs, j, change)[..., None]
+
+
+def _logged(
+    runs: Sequence[DisturbedRun], j: int, signal: Callable[[DisturbedRun], FloatArray]
+) -> FloatArray:
+    """Changes by a signal (n_samples,) of each record beside what is logged of an output."""
+    return of_each(runs, lambda run: run.logged(_column(run.outputs, j, signal(run))))
 
 
 _Change = Callable[[DisturbedRun, int, float], FloatArray]
@@ -214,7 +216,7 @@ def _with_play(run: DisturbedRun, i: int, width: float) -> FloatArray:
 def _acted_before(run: DisturbedRun, i: int, time: float) -> FloatArray:
     """What is logged late has acted before."""
     held = run.model.inputs[i].hold == "zoh"
-    return _shifted(_acting(run, i), time / run.record.dt, held)
+    return shifted(_acting(run, i), time / run.record.dt, held)
 
 
 def _unfiltered(run: DisturbedRun, i: int, time: float) -> FloatArray:
@@ -225,7 +227,7 @@ def _unfiltered(run: DisturbedRun, i: int, time: float) -> FloatArray:
 
 
 def _lagging(run: DisturbedRun, i: int, time: float) -> FloatArray:
-    return _smoothed(_acting(run, i), time / run.record.dt)
+    return smoothed(_acting(run, i), time / run.record.dt)
 
 
 def _acting(run: DisturbedRun, i: int) -> FloatArray:
@@ -235,7 +237,7 @@ def _acting(run: DisturbedRun, i: int) -> FloatArray:
     it does by its second power, next to nothing, to be one.
     """
     signal, deviation = run.record.inputs[:, i], float(run.record.input_noise[i])
-    return signal - likely_noise(signal, deviation) if deviation else signal
+    return signal - likely_noise(signal, deviation, float(run.colour[i])) if deviation else signal
 
 
 _LATE_INPUTS: dict[Kind, _Change] = {
@@ -245,7 +247,7 @@ _LATE_INPUTS: dict[Kind, _Change] = {
 }
 
 
-def _smoothed(signal: FloatArray, samples: float) -> FloatArray:
+def smoothed(signal: FloatArray, samples: float) -> FloatArray:
     """Change of a signal by a filter of first order with this time constant."""
     if not samples > 0.0:
         return np.zeros_like(signal)
@@ -254,12 +256,6 @@ def _smoothed(signal: FloatArray, samples: float) -> FloatArray:
     smoothed = all_pole(np.array([-pole]), (1.0 - pole) * moved[:, None])
     change: FloatArray = smoothed[:, 0] - moved
     return change
-
-
-def _shifted(signal: FloatArray, samples: float, held: bool) -> FloatArray:
-    """Change of a signal that is taken so many samples later."""
-    places = np.clip(np.arange(len(signal)) + samples, 0.0, len(signal) - 1.0)
-    return at_places(signal, places, held) - signal
 
 
 def in_single_records(
@@ -286,8 +282,10 @@ def _within(rows: slice, late: Callable[[float], FloatArray], delay: float) -> F
     return part
 
 
-def likely_noise(signal: FloatArray, deviation: float) -> FloatArray:
-    """What of a signal (n,) is likely to be its white noise of this deviation: Wiener's filter.
+def likely_noise(signal: FloatArray, deviation: float, colour: float = 0.0) -> FloatArray:
+    """What of a signal (n,) is likely to be its noise of this deviation: Wiener's filter.
+
+    colour: part of the noise that goes on from sample to sample; none of white noise.
 
     >>> rng = np.random.default_rng(0)
     >>> noise = 0.1 * rng.standard_normal(1000)
@@ -302,7 +300,9 @@ def likely_noise(signal: FloatArray, deviation: float) -> FloatArray:
     padded = np.pad(power, width, mode="reflect") if len(power) > width else power
     kernel = np.ones(2 * width + 1) / (2 * width + 1)
     smooth = np.convolve(padded, kernel, "valid") if len(padded) > len(power) else power
-    share = np.minimum(deviation**2 / np.maximum(smooth, 1e-300), 1.0)
+    turn = np.exp(-2j * np.pi * np.arange(len(power)) / n)
+    noise_power = deviation**2 * (1.0 - colour**2) / np.abs(1.0 - colour * turn) ** 2
+    share = np.minimum(noise_power / np.maximum(smooth, 1e-300), 1.0)
     likely: FloatArray = np.fft.irfft(spectrum * share, n)
     return likely
 
@@ -480,10 +480,16 @@ def curve_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         signal = np.concatenate([run.outputs[:, j] for run in runs])
         centre, size = 0.5 * (signal.max() + signal.min()), 0.5 * np.ptp(signal)
         if size > 0.0:
-            z = (signal - centre) / size
-            changes = np.zeros((len(z), len(runs[0].model.outputs), 2))
-            changes[:, j] = size * np.stack([z**2, z**3], axis=1)
-            yield Suspect("curve", output.name, "1", changes)
+            columns = [
+                _logged(runs, j, partial(_curved, j, float(centre), float(size), power))
+                for power in (2, 3)
+            ]
+            yield Suspect("curve", output.name, "1", np.stack(columns, axis=2))
+
+
+def _curved(j: int, centre: float, size: float, power: int, run: DisturbedRun) -> FloatArray:
+    curved: FloatArray = size * ((run.outputs[:, j] - centre) / size) ** power
+    return curved
 
 
 def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:

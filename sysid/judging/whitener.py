@@ -32,6 +32,8 @@ class Whitener:
         counted = local.objective.weights > 0.0
         measured = counted & local.seen
         residual = np.where(measured, residual, 0.0)
+        if local.corrects:
+            return cls._of_innovations(local, residual)
         model = colour_about_line(residual, local.seen, measured, local.lengths)
         values, vectors = np.linalg.eigh(model.noise)
         floor = 1e-12 * max(float(values[-1]), 1e-300)
@@ -43,6 +45,18 @@ class Whitener:
                 kept[rows][k:] &= whole[rows][:-k]
             kept[rows][:order] = False
         return cls(model, local.lengths, kept, (vectors * roots) @ vectors.T)
+
+    @classmethod
+    def _of_innovations(cls, local: Sensitivity, residual: FloatArray) -> Self:
+        """By innovations, which are white, and of each output independent of the others'.
+
+        An output that is seldom measured takes no row from the others.
+        """
+        q = residual.shape[1]
+        squares = np.sum(residual**2, axis=0) / np.maximum(local.seen.sum(axis=0), 1)
+        sizes = np.where(squares > 0.0, 1.0 / np.sqrt(np.maximum(squares, 1e-300)), 0.0)
+        model = Autoregression(np.zeros((0, q, q)), np.diag(squares))
+        return cls(model, local.lengths, np.ones(len(residual), dtype=bool), np.diag(sizes))
 
     @cached_property
     def n_outputs(self) -> int:

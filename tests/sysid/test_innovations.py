@@ -30,7 +30,7 @@ from sysid.fitting.refinement import refine
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.likelihood import better_by_filter, noisy_fit, towards
 from sysid.gassi.optima import Optimum
-from sysid.judging.examination import verdict_of
+from sysid.judging.examination import suspected, verdict_of
 from sysid.uncertainty import uncertainty
 from sysid.uncertainty.sensitivity import sensitivity
 from tests.sysid.support import lag, linear_response, prbs
@@ -503,6 +503,28 @@ def test_what_a_model_may_lack_is_not_tested_where_noise_moves_free_runs_too_far
     assert verdict.parameters.trust == "limited"
     assert any("may lack was not tested" in reason for reason in verdict.parameters.reasons)
     assert not any("The data ask for" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize("late", [0, 5])
+def test_what_a_model_may_lack_is_tested_by_the_innovations_of_averaged_inputs(late):
+    """Where noise hides no bend of what is left: a right model lacks nothing, a delay is named."""
+    rng = np.random.default_rng(0)
+    u = 3.0 * np.sin(0.5 * np.arange(4000) * DT)
+    acting = np.abs(np.append(np.zeros(late), u[: 4000 - late]))[:, None]
+    y = linear_response(np.array([[-1.0 / TAU]]), np.array([[GAIN / TAU]]), acting, DT, "zoh")
+    y = y + 0.2 * rng.standard_normal(y.shape)
+    noisy = u + 0.3 * rng.standard_normal(4000)
+    record = Dataset(noisy, y, DT, input_noise=np.array([0.3]))
+    fit = GASSI(BENT, population=20, generations=8, criterion="innovations").fit(record)
+    suspicion = suspected(fit, fit.uncertainty(record), [record])
+    assert fit.averaged_inputs_ and suspicion is not None
+    counting = [f for f in suspicion.findings if f.counts]
+    if late:
+        surest = counting[0]
+        assert (surest.kind, surest.name) == ("delay", "y")
+        assert surest.amplitude == pytest.approx(late * DT, rel=0.1)
+    else:
+        assert not counting
 
 
 def test_innovations_count_by_what_noise_does_to_them_at_a_bend():
