@@ -37,13 +37,19 @@ class EarlierFit:
             if name in values
         )
 
-    def explains(self, values: Mapping[str, float], noise: Mapping[str, float]) -> bool:
+    def explains(
+        self, values: Mapping[str, float], noise: Mapping[str, float], least: Mapping[str, float]
+    ) -> bool:
         """Whether a fit of all logs is near, and needs no more noise than that of some of them did.
 
-        noise: of outputs by name, by which a filter judged all logs.
+        noise: of outputs by name, by which a filter judged all logs; least: what it is at least,
+        whatever a fit explains, which depends on the logs.
         """
         before = self.minima.noise
-        noisier = (now > _NOISIER * before.get(name, now) for name, now in noise.items())
+        noisier = (
+            now > _NOISIER * max(before.get(name, now), least.get(name, 0.0))
+            for name, now in noise.items()
+        )
         return self.is_near(values) and not any(noisier)
 
     def agrees(self, result: Identification) -> bool:

@@ -19,7 +19,7 @@ from daq.identification.foreign import ColumnMapping
 from daq.identification.placement import placement_faults
 from daq.identification.records import LoggedRecord, Split
 from daq.identification.request import SettingsRequest
-from daq.identification.result import FittedLog, Identification, filter_noise
+from daq.identification.result import FittedLog, Identification, filter_noise, least_noise
 from daq.identification.selection import EVERYTHING, Selection
 from daq.identification.settings import Problem, gassi_settings, problem_of
 from daq.logs.capture import LOG_NAME
@@ -195,7 +195,8 @@ def _beside(
     with contextlib.suppress(ConfigError):  # a simulation that fails there
         estimator = _searched(problem, logs[0], None, watch, False, earlier.minima)
         interrupted = estimator.stopped_ == "interrupted"
-        if interrupted or earlier.explains(estimator.parameters_, filter_noise(estimator)):
+        noise = filter_noise(estimator), least_noise(estimator)
+        if interrupted or earlier.explains(estimator.parameters_, *noise):
             problem = problem.starting(estimator.estimated_starts_)
             tell_starts(estimator.estimated_starts_, watch)
             result = assemble(problem, estimator, logs, folder, watch, faults)

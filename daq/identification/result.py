@@ -572,7 +572,15 @@ def _in_parts_of_noise(result: RecordResult, j: int) -> dict[str, float]:
 
 def filter_noise(estimator: GASSI) -> dict[str, float]:
     """Noise of the outputs by which a filter judged a fit, in their units; empty without one."""
-    noise = estimator.output_noise_
+    return _by_output(estimator, estimator.output_noise_)
+
+
+def least_noise(estimator: GASSI) -> dict[str, float]:
+    """What it is at least, in their units; empty without a filter."""
+    return _by_output(estimator, estimator.least_noise_)
+
+
+def _by_output(estimator: GASSI, noise: FloatArray | None) -> dict[str, float]:
     if estimator.criterion_ != "innovations" or noise is None:
         return {}
     return dict(zip(estimator.simulator().model.output_names, map(float, noise), strict=True))

@@ -326,7 +326,7 @@ class Innovations(Objective):
         steps = self.steps_needed(chromosome[None])
         # Noise of the inputs and of the process may explain nearly all of a free run's error.
         least = (_LEAST_OF_FILTER if self.corrects else _LEAST_NOISE) * self.error
-        least = np.maximum(least, self._least_scatter)
+        least = np.maximum(least, self.least_noise)
         settled, last = self, None
         for _ in range(_ROUNDS):
             innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
@@ -387,7 +387,7 @@ class Innovations(Objective):
         return bool(self.process.any())
 
     @property
-    def _least_scatter(self) -> FloatArray:
+    def least_noise(self) -> FloatArray:
         """Deviation beside the scatter, (n_outputs,), that the tenth with the least not tell all.
 
         By a part of what the others have: samples that have that much would have twice as much.

@@ -137,7 +137,7 @@ class GASSI(RecordEstimator):
     output_weights_ : (n_outputs,), final weights of the outputs.
     criterion_, criterion_reason_ : what it was, and why.
     output_noise_ : (n_outputs,), noise of the outputs, None where that of inputs and process does
-        not count.
+        not count. least_noise_ : below which it is not sought, as where edges time a speed.
     averaged_inputs_ : whether a filter took noisy inputs as averages.
     rivals_ : parameters in each further minimum that explains the data as well as the result.
     error_ : mean over outputs of the RMSE normalised by max|y| (see ``Objective``); of ``cega``
@@ -253,6 +253,7 @@ class GASSI(RecordEstimator):
         self._final_accuracy = self.accuracy
         self.criterion_, self.criterion_reason_ = self._criterion(data, preset)
         self.output_noise_: FloatArray | None = None
+        self.least_noise_: FloatArray | None = None
         self.averaged_inputs_ = False
         self.excerpt_ = self._excerpt(data) if preset.refine else None
         searched = self._searched(objective)
@@ -378,6 +379,7 @@ class GASSI(RecordEstimator):
         self.output_weights_ = likeliest.objective.weights
         if isinstance(likeliest.objective, Innovations):
             self.output_noise_ = likeliest.objective.noise
+            self.least_noise_ = likeliest.objective.least_noise
             self.averaged_inputs_ = likeliest.objective.quiet
             if likeliest.objective.corrects and self.criterion_ == "compensated":
                 self.criterion_, self.criterion_reason_ = "innovations", _OVERWHELMED

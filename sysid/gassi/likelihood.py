@@ -498,7 +498,8 @@ def noisy_fit(
     corrects, process: as of ``Innovations``. noise: (n_outputs,), by which it is descended from
     first, where what is seen at the optimum would be too much. None as of ``_refitted``.
     """
-    chromosome, rms = optimum.chromosome, optimum.rms
+    # Of its free run: a filter's errors are in parts of noise that may be next to none.
+    chromosome, rms = optimum.chromosome, optimum.by(optimum.objective).rms
     settings: dict[str, Any] = {"corrects": corrects, "process": process}
     if noise is not None:
         assumed = Innovations.of(optimum.objective, noise, near=chromosome, **settings)

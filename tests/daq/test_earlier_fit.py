@@ -82,8 +82,10 @@ def test_logs_at_odds_or_noisier_than_before_speak_against_a_start(case):
     result, noise = case[2], case[2].document["criterion"]["noise"]
     earlier = EarlierFit(EarlierMinima([values], noise), ends)
     assert earlier.agrees(result)
-    assert earlier.explains(values, noise)
-    assert not earlier.explains(values, {**noise, "omega": 3.0 * noise["omega"]})
+    assert earlier.explains(values, noise, {})
+    thrice = {**noise, "omega": 3.0 * noise["omega"]}
+    assert not earlier.explains(values, thrice, {})
+    assert earlier.explains(values, thrice, {"omega": thrice["omega"]})  # the least of these logs
     at_odds = replace(result, uncertainty=replace(result.uncertainty, disagreement=5.0))
     assert not earlier.agrees(at_odds)
 

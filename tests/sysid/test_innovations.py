@@ -631,9 +631,12 @@ def test_an_output_whose_error_is_all_of_an_inputs_noise_counts_like_the_others(
     by_error = Optimum(objective, start, objective.rms(start[None])[0], feasible=True)
     fit = noisy_fit(True, None, objective, by_error)
     assert fit.rms[0] < 1e-3 * fit.rms[1]
-    parts = fit.objective.weights * fit.rms
-    assert parts[0] == pytest.approx(parts[1], rel=0.01)
-    assert fit.chromosome == pytest.approx([GAIN, TAU], rel=0.15)
+    # Nor does it count for less where a fit goes on from a filter's minimum.
+    again = noisy_fit(True, None, objective, replace(fit, objective=objective))
+    for each in (fit, again):
+        parts = each.objective.weights * each.rms
+        assert parts[0] == pytest.approx(parts[1], rel=0.01)
+        assert each.chromosome == pytest.approx([GAIN, TAU], rel=0.15)
 
 
 def two_lags():
