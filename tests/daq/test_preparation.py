@@ -222,6 +222,6 @@ def test_a_replay_reads_a_log_as_the_identification_did(folder):
     again = shlex.split(shown.partition("rig replay ")[2])
     replayed = rig("replay", *again, cwd=folder)
     assert replayed.returncode == 0, replayed.stderr
-    fit = re.search(r"^ y .* ([\d.-]+) $", replayed.stdout, re.MULTILINE)[1]
+    fit = re.search(r"^ y .* ([\d.-]+)$", replayed.stdout, re.MULTILINE)[1]
     assert float(fit) > 99.0, "neither moved nor turned round it fits far worse"
     assert str(folder) not in done.stdout
