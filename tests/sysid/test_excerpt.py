@@ -90,7 +90,7 @@ def test_a_record_starts_where_the_part_at_its_beginning_does():
     parts = excerpt.on_parts(whole, of_parts, chromosome)
     assert parts.tolist() == [2.0, 0.05, 1.0, *[of_parts.parameters[-2].nominal] * 3, 5.0]
     bare, (alone,) = excerpt.on_all(plain, [np.array([2.0, 0.05])])
-    assert bare == plain and alone.tolist() == [2.0, 0.05]
+    assert bare.names == plain.names and alone.tolist() == [2.0, 0.05]
 
 
 def test_of_many_short_records_those_that_differ_most_are_enough():
