@@ -13,6 +13,7 @@ the mean. Without gains it is the response of a free run.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -192,14 +193,24 @@ def _along(
     function: Any, states: FloatArray, inputs: FloatArray, vector: FloatArray, side: int, place: int
 ) -> FloatArray:
     """Slopes of a model's function over a state (side 0) or an input (side 1), by its place."""
-    step = _STEP * max(float(np.abs((states, inputs)[side][:, place]).max()), _STEP)
-    values = []
-    for sign in (1.0, -1.0):
+
+    def moved(step: float) -> FloatArray:
         sides = [states.copy(), inputs.copy()]
-        sides[side][:, place] += sign * step
-        values.append(evaluated(function, *sides, vector[None]))
-    slopes: FloatArray = (values[0] - values[1]) / (2.0 * step)
-    return slopes
+        sides[side][:, place] += step
+        return evaluated(function, *sides, vector[None])
+
+    largest = float(np.abs((states, inputs)[side][:, place]).max())
+    return slope_of(moved, _STEP * max(largest, _STEP))
+
+
+def slope_of(values: Callable[[float], FloatArray], step: float) -> FloatArray:
+    """Slope at zero of what follows a move, by central differences.
+
+    >>> slope_of(lambda move: np.array([2.0 * move, move**2]), 0.5).tolist()
+    [2.0, 0.0]
+    """
+    slope: FloatArray = (values(step) - values(-step)) / (2.0 * step)
+    return slope
 
 
 def _row(kernel: FilterKernel, j: int, of_outputs: FloatArray, mean: FloatArray) -> FloatArray:

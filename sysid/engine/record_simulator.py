@@ -233,7 +233,7 @@ class RecordSimulator:
         sums = np.empty((2 * len(noise), LANES))
         work = work_area(kernel.work_rows * LANES)
         inputs = self._inputs_of.get(tuple(kernel.splines))
-        if inputs is None:  # likewise
+        if inputs is None:  # the same in every run of a fit
             inputs = with_bends(model, record, kernel.splines)
             self._inputs_of[tuple(kernel.splines)] = inputs
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)

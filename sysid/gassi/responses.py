@@ -11,6 +11,7 @@ the minimum stands: to trade places parameters may have to leave where chance ha
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ _APART = 0.03  # of the ranges, within which two places are one
 _MOST = 6
 _SLIDES, _SLIDE = 25, 0.1  # along ties, and parts of the ranges of the first at most
 _CORRECTIONS, _SAME = 3, 1e-3  # after each, and what may be missing then
-_EAGER = 1.5  # by which slides grow that lead on
+_EAGER, _WARY = 1.5, 0.3  # by which slides grow that lead on, and shrink that do not
 _ON_END = 1e-3  # parts of a range
 
 
@@ -83,8 +84,7 @@ class _Responses:
         """Places of parameters that the response tells apart, the one that does most first."""
         if not self._reference.size:  # no input varies
             return np.empty(0, dtype=np.int64)
-        slopes = self._slopes(self.start[None], np.arange(len(self.start)))[0]
-        chosen: list[int] = []
+        slopes, chosen = self._own_slopes, list[int]()
         largest = np.linalg.norm(slopes, axis=0).max(initial=0.0)
         while len(chosen) < slopes.shape[1]:
             sizes = np.linalg.norm(slopes, axis=0)
@@ -101,8 +101,7 @@ class _Responses:
         free, count = self.independent(), len(self.start)
         if not len(free):
             return np.zeros((0, count))
-        slopes = self._slopes(self.start[None], np.arange(count))[0]
-        others = np.setdiff1d(self.moving(), free)
+        slopes, others = self._own_slopes, np.setdiff1d(self.moving(), free)
         directions = np.eye(count)[others]
         directions[:, free] = -np.linalg.lstsq(slopes[:, free], slopes[:, others])[0].T
         directions[np.abs(directions) < _ROUNDING] = 0.0
@@ -112,9 +111,14 @@ class _Responses:
         """Places of parameters that move the response."""
         if not self._reference.size:  # no input varies
             return np.empty(0, dtype=np.int64)
-        slopes = self._slopes(self.start[None], np.arange(len(self.start)))[0]
-        sizes = np.linalg.norm(slopes, axis=0)
+        sizes = np.linalg.norm(self._own_slopes, axis=0)
         return np.flatnonzero(sizes > _ROUNDING * sizes.max(initial=0.0))
+
+    @cached_property
+    def _own_slopes(self) -> FloatArray:
+        """Those at the start by all parameters, (m, n_free)."""
+        slopes: FloatArray = self._slopes(self.start[None], np.arange(len(self.start)))[0]
+        return slopes
 
     def beside(
         self, at: FloatArray, misses: FloatArray, moving: IntArray
@@ -136,7 +140,7 @@ class _Responses:
             kept = missed < np.maximum(misses[going], _SAME)
             on = going[kept]
             at[on], misses[on] = trial[kept], missed[kept]
-            reach[going] *= np.where(kept, _EAGER, _EASED)
+            reach[going] *= np.where(kept, _EAGER, _WARY)
             going = going[(longest > _ON_END) & (reach[going] > _ON_END)]
         return at, misses
 

@@ -248,8 +248,7 @@ def _moved_windows(runs: Sequence[DisturbedRun], *ways: str) -> FloatArray:
     of ``its`` jitter each, or ``all`` by the same.
     """
     changes = [of_each(runs, partial(_later, way)) for way in ways]
-    whole = np.stack(changes, axis=2)
-    return whole[..., whole.any(axis=(0, 1))]
+    return _felt(np.stack(changes, axis=2))
 
 
 def _later(way: str, run: DisturbedRun) -> FloatArray:

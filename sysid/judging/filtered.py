@@ -6,13 +6,13 @@ they would do is bent. A filter knows where the plant is, and its innovations ar
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.engine.filter_response import FilterResponse
+from sysid.engine.filter_response import FilterResponse, slope_of
 from sysid.engine.trace import evaluated, rates_along
 from sysid.engine.windows import average
 from sysid.fitting.innovations import Innovations
@@ -81,7 +81,7 @@ class FilteredRun(DisturbedRun):
         """Outputs of these states at their instants, (n_samples, n_outputs)."""
         if self.model.output is None:
             return self.states[:, list(self.model.output_states or ())]
-        return evaluated(self.model.output, self.states, self.record.inputs, self.vector[None])
+        return self._observed(0.0, 0.0)
 
     def averaged(self, j: int, signal: FloatArray) -> FloatArray:
         """A change (n_samples,) of output j at its instants as its sensor averages it."""
@@ -141,18 +141,7 @@ class FilteredRun(DisturbedRun):
         size = np.max(np.abs(vector) / np.maximum(np.abs(self.vector), 1e-300), initial=0.0)
         if not size:
             return np.zeros(self.record.outputs.shape)
-        eps = _SMALL / size
-        up, down = (
-            evaluated(
-                self.model.output,
-                self.states,
-                self.record.inputs,
-                (self.vector + sign * eps * vector)[None],
-            )
-            for sign in (1.0, -1.0)
-        )
-        change: FloatArray = (up - down) / (2.0 * eps)
-        return change
+        return slope_of(lambda part: self._observed(0.0, part * vector), _SMALL / size)
 
     @cached_property
     def _slopes(self) -> list[FloatArray]:
@@ -160,8 +149,7 @@ class FilteredRun(DisturbedRun):
         slopes = []
         for i in range(self.record.inputs.shape[1]):
             step = _SMALL * (float(np.abs(self.record.inputs[:, i]).max()) or 1.0)
-            up, down = (self._rates_by(i, sign * step) for sign in (1.0, -1.0))
-            slopes.append((up - down) / (2.0 * step))
+            slopes.append(slope_of(partial(self._rates_by, i), step))
         return slopes
 
     def _rates_by(self, i: int, step: float) -> FloatArray:
@@ -173,17 +161,12 @@ class FilteredRun(DisturbedRun):
         """Change of the outputs by that of the inputs at the same instant."""
         size = float(np.abs(inputs).max()) or 1.0
         eps = _SMALL * (float(np.abs(self.record.inputs).max()) or 1.0) / size
-        up, down = (
-            evaluated(
-                self.model.output,
-                self.states,
-                self.record.inputs + sign * eps * inputs,
-                self.vector[None],
-            )
-            for sign in (1.0, -1.0)
-        )
-        change: FloatArray = (up - down) / (2.0 * eps)
-        return change
+        return slope_of(lambda part: self._observed(part * inputs, 0.0), eps)
+
+    def _observed(self, inputs: FloatArray | float, vector: FloatArray | float) -> FloatArray:
+        """Outputs of the states with something added to the inputs, and to the parameters."""
+        vectors = (self.vector + vector)[None]
+        return evaluated(self.model.output, self.states, self.record.inputs + inputs, vectors)
 
     def _finite(self, change: FloatArray) -> FloatArray:
         scaled = change * self.scale
