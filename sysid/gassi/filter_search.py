@@ -15,7 +15,9 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import begin, refine_each
 from sysid.gassi.excerpt import Excerpt
+from sysid.gassi.noise_fit import NoiseFit, foresees_more
 from sysid.gassi.operators import stratified
+from sysid.gassi.optima import Optimum
 from sysid.uncertainty.colour import SUCCESSIVE, successive_correlation
 
 SAMPLES = 3072  # that tell enough
@@ -25,6 +27,25 @@ _SPREAD = 512  # chromosomes
 _LITTLE = 0.1
 # Descents, iterations and tolerance of each stage.
 _STAGES, _ROUGHLY = ((16, 5), (8, 15), (3, 30)), 1e-4
+
+
+def better_by_filter(
+    fit: NoiseFit, first: Optimum, others: list[FloatArray]
+) -> tuple[Optimum, list[FloatArray]]:
+    """A filter's minimum and starts (n_free,) for others, or better ones.
+
+    Sought where its innovations could be foreseen, which are white at the right parameters.
+    """
+    fitted = first.objective
+    assert isinstance(fitted, Innovations)
+    little = coloured(fitted, first.chromosome)
+    if not little.any():
+        return first, others
+    start, *rest = by_filter(fit.weighed, fitted, little)
+    anew = fit(start)
+    if anew is None or not foresees_more(anew, first):
+        return first, others
+    return anew, rest
 
 
 def coloured(fitted: Innovations, chromosome: FloatArray) -> BoolArray:

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -26,8 +26,9 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
 from sysid.gassi.excerpt import Excerpt
-from sysid.gassi.filter_search import SAMPLES, by_filter, coloured
+from sysid.gassi.filter_search import SAMPLES, better_by_filter
 from sysid.gassi.lookalikes import lookalikes
+from sysid.gassi.noise_fit import NoiseFit, filters, foresees_more, too_well
 from sysid.gassi.optima import (
     LEAST_SHARE,
     QUICKLY,
@@ -39,14 +40,11 @@ from sysid.gassi.optima import (
     chromosomes_of,
     to_compare,
 )
-from sysid.gassi.slide import slid
+from sysid.gassi.slide import centred, slid
 from sysid.problem.earlier_minima import EarlierMinima
 
 _ROUNDS = 6  # of weights and parameters in turn
-_NOISE_ROUNDS = 20  # the same of noise, weights and parameters
 _STEADY = 1e-3  # share by which weights may still change
-_RENEWED = 0.05  # change of a noise, where all else has come to rest, by which a fit goes on
-_SWINGING = -0.5  # a round's change of a noise's logarithm in parts of the one before
 # Deviance above which a further bottom of one valley does not count, where chance has but one
 # direction: which of two is the deeper varies by twice the root of how far apart they are, more
 # than within either.
@@ -132,9 +130,8 @@ def fit_likelihood(
     refitted = None
     if noise is not None:
         for corrects in (False, True) if noise == "compensated" else (True,):
-            fit = partial(noisy_fit, corrects, process, objective)
-            ranked = [best, *others]
-            refitted = refitted or _refitted(fit, objective, ranked, optima, begun, watch)
+            fit = NoiseFit(objective, best.objective, corrects, process, watch)
+            refitted = refitted or _refitted(fit, [best, *others], optima, begun)
     if refitted is not None:
         optima = refitted
         best, *others = optima.ranked()
@@ -149,7 +146,7 @@ def fit_likelihood(
 def _resting(best: Optimum) -> Optimum:
     """The minimum of a filter with as many steps as an answer wants, and by what bends there."""
     fitted = best.objective
-    if not (isinstance(fitted, Innovations) and fitted.corrects):
+    if not filters(fitted):
         return best
     finer = fitted.exactly(best.chromosome)
     if finer.coarseness == fitted.coarseness and not fitted.quiet:
@@ -179,9 +176,15 @@ def promising(
 
 
 def _slid(optimum: Optimum) -> Optimum:
-    objective = optimum.objective
-    end = slid(objective, optimum.chromosome)
-    return optimum if end is None else Optimum.of(objective, end.chromosome, end.rms)
+    return _moved(optimum, slid(optimum.objective, optimum.chromosome))
+
+
+def _centred(optimum: Optimum) -> Optimum:
+    return _moved(optimum, centred(optimum.objective, optimum.chromosome))
+
+
+def _moved(optimum: Optimum, end: Refinement | None) -> Optimum:
+    return optimum if end is None else Optimum.of(optimum.objective, end.chromosome, end.rms)
 
 
 def _explored(
@@ -250,12 +253,7 @@ def _weighed(
 
 
 def _refitted(
-    fit: Callable[[Optimum, Watch | None], Optimum | None],
-    objective: Objective,
-    ranked: Sequence[Optimum],
-    by_error: Optima,
-    begun: Begun,
-    watch: Watch | None,
+    fit: NoiseFit, ranked: Sequence[Optimum], by_error: Optima, begun: Begun
 ) -> Optima | None:
     """The best optimum and those not told from it by the error, refitted for noisy inputs.
 
@@ -267,57 +265,77 @@ def _refitted(
     """
     # Without its noise a filter is not begun better there than where free runs lead.
     goes_on = begun.is_settled and begun.noise is not None and len(begun.chromosomes) > 0
-    first = _beside(fit, ranked[0], begun, watch) if goes_on else fit(ranked[0], watch)
+    first = _beside(fit, begun) if goes_on else fit(ranked[0].chromosome)
     if first is None:
         return None
     likely = [o for o in ranked[1:] if by_error.deviance(o, ranked[0]) < _CONCEIVABLE]
     starts = [optimum.chromosome for optimum in likely]
-    filters = isinstance(first.objective, Innovations) and first.objective.corrects
-    if filters and begun.chromosomes and not begun.is_settled:
-        first, more = _from_begun(fit, first, begun, ranked[0], watch)
+    filtered = filters(first.objective)
+    if filtered and begun.chromosomes and not begun.is_settled:
+        first, more = _from_begun(fit, first, begun)
         starts += more
-    if filters:
-        first, starts = better_by_filter(fit, first, starts, ranked[0], watch)
-    too_well = _too_well(ranked[0].rms)
-    optima, explored = Optima.around(first, objective, too_well), None
+    if filtered:
+        first, starts = better_by_filter(fit, first, starts)
+        first = _centred(first)
+    scale = too_well(ranked[0].rms)
+    optima, explored = Optima.around(first, fit.given, scale), None
     (first,) = (best,) = optima.ranked()
-    for _ in range(_EXPLORED_BY_FILTER if filters else 1):
+    for _ in range(_EXPLORED_BY_FILTER if filtered else 1):
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break
         explored = best
-        explores = filters and not begun.is_settled
+        explores = filtered and not begun.is_settled
         starts += lookalikes(first.objective, best.chromosome) if explores else []
-        exact = _exact_among(first, starts) if filters else None
+        exact = _exact_among(first, starts) if filtered else None
         if exact is not None:
-            optima = Optima.around(exact, objective, too_well)
+            optima = Optima.around(exact, fit.given, scale)
             (first,) = (best,) = (explored,) = optima.ranked()
         ends = _conceivable(first.objective, starts, optima, best)
         for optimum in _compared(first.objective, ends):
             optima.add(optimum)
         (best, *others), starts = optima.ranked(), []
-        if filters and optima.deviance(first, best) > TOLD_APART:
-            anew = fit(replace(best, objective=ranked[0].objective), watch)
-            if anew is None or not _foresees_more(anew, first):
+        if filtered and optima.deviance(first, best) > TOLD_APART:
+            anew = fit(best.chromosome)
+            if anew is None or not foresees_more(anew, first):
                 optima.refit(best, anew)
                 best = optima.ranked()[0]
             else:
                 near = (o for o in others if optima.deviance(o, best) < _CONCEIVABLE)
                 starts = [optimum.chromosome for optimum in near]
-                optima, explored = Optima.around(anew, objective, too_well), None
+                optima, explored = Optima.around(anew, fit.given, scale), None
                 (first,) = (best,) = optima.ranked()
     if best is not first:
-        optima.refit(best, fit(replace(best, objective=ranked[0].objective), watch))
+        optima.refit(best, fit(best.chromosome))
     return optima
 
 
 def _compared(objective: Objective, ends: Sequence[Refinement]) -> list[Optimum]:
-    """Minima beside where descents have ended, as they are compared with ones far from them."""
+    """Minima beside where descents have ended, as they are compared with ones far from them.
+
+    Steps that do at one minimum may be too coarse at another, which then seems to be elsewhere.
+    """
     if not ends:
         return []
-    begun = [begin(objective, end.chromosome) for end in ends]
-    chromosomes = [end.chromosome for end in refine_each(objective, begun)]
+    finer = _fine_enough(objective, ends)
+    begun = [begin(finer, end.chromosome) for end in ends]
+    chromosomes = [_inside(finer, end.chromosome) for end in refine_each(finer, begun)]
     errors = to_compare(objective).rms(np.stack(chromosomes))
     return [Optimum.of(objective, *pair) for pair in zip(chromosomes, errors, strict=True)]
+
+
+def _fine_enough(objective: Objective, ends: Sequence[Refinement]) -> Objective:
+    """An objective with as many steps as an answer at the most demanding of the ends wants."""
+    if not filters(objective):
+        return objective
+    for end in ends:
+        objective = objective.exactly(end.chromosome)
+    return objective
+
+
+def _inside(objective: Objective, chromosome: FloatArray) -> FloatArray:
+    """A minimum (n_free,) at no end of a range that only ties reach."""
+    end = slid(objective, chromosome)
+    return chromosome if end is None else end.chromosome
 
 
 def _exact_among(first: Optimum, starts: Sequence[FloatArray]) -> Optimum | None:
@@ -339,7 +357,7 @@ def _conceivable(
     None is left out for another of them, which may be at its end sooner.
     """
     # A filter forgets where an excerpt starts, as free runs do not.
-    if isinstance(objective, Innovations) and objective.corrects and starts:
+    if filters(objective) and starts:
         excerpt = Excerpt.of(objective.records, SAMPLES, every=False)
         if excerpt is not None:
             easier = objective.eased(best.chromosome, _MOVING)
@@ -423,136 +441,19 @@ def _known(
     return not new(objective.space.decode(point.at), before)
 
 
-def better_by_filter(
-    fit: Callable[[Optimum, Watch | None], Optimum | None],
-    first: Optimum,
-    others: list[FloatArray],
-    by_error: Optimum,
-    watch: Watch | None,
-) -> tuple[Optimum, list[FloatArray]]:
-    """A filter's minimum and starts (n_free,) for others, or better ones.
-
-    Sought where its innovations could be foreseen, which are white at the right parameters.
-    by_error: the minimum of free runs that it began with.
-    """
-    fitted = first.objective
-    assert isinstance(fitted, Innovations)
-    little = coloured(fitted, first.chromosome)
-    if not little.any():
-        return first, others
-    start, *rest = by_filter(by_error.objective, fitted, little)
-    anew = fit(replace(by_error, chromosome=start), watch)
-    if anew is None or not _foresees_more(anew, first):
-        return first, others
-    return anew, rest
-
-
-def _beside(
-    fit: Callable[..., Optimum | None], by_error: Optimum, begun: Begun, watch: Watch | None
-) -> Optimum | None:
-    """The minimum beside that of an earlier fit, by the weights of one of the error.
+def _beside(fit: NoiseFit, begun: Begun) -> Optimum | None:
+    """The minimum beside that of an earlier fit.
 
     The earlier noise tells the right minimum from afar: what innovations of new records show at the
     earlier one may be far more.
     """
-    return fit(replace(by_error, chromosome=begun.chromosomes[0]), watch, begun.noise)
+    return fit(begun.chromosomes[0], begun.noise)
 
 
-def _from_begun(
-    fit: Callable[..., Optimum | None],
-    first: Optimum,
-    begun: Begun,
-    by_error: Optimum,
-    watch: Watch | None,
-) -> tuple[Optimum, list[FloatArray]]:
+def _from_begun(fit: NoiseFit, first: Optimum, begun: Begun) -> tuple[Optimum, list[FloatArray]]:
     """The better of a filter's minimum and one beside that of an earlier fit, and other starts."""
-    anew, rivals = _beside(fit, by_error, begun, watch), begun.chromosomes[1:]
+    anew, rivals = _beside(fit, begun), begun.chromosomes[1:]
     if anew is None:
         return first, [*rivals]
-    better, worse = (anew, first) if _foresees_more(anew, first) else (first, anew)
+    better, worse = (anew, first) if foresees_more(anew, first) else (first, anew)
     return better, [worse.chromosome, *rivals]
-
-
-def _foresees_more(optimum: Optimum, rival: Optimum) -> bool:
-    """Whether its innovations are the less, by the lesser noise of both filters."""
-    fitted, before = optimum.objective, rival.objective
-    assert isinstance(fitted, Innovations) and isinstance(before, Innovations)
-    if optimum.feasible != rival.feasible:
-        return optimum.feasible
-    common = fitted.of_noise(np.minimum(fitted.noise, before.noise)).uneased
-    rms = common.rms(np.stack([optimum.chromosome, rival.chromosome]))
-    loss = np.log(np.maximum(rms, TINY)) @ (fitted.counts * (fitted.weights > 0.0))
-    return bool(loss[0] < loss[1])
-
-
-def noisy_fit(
-    corrects: bool,
-    process: FloatArray | None,
-    objective: Objective,
-    optimum: Optimum,
-    watch: Watch | None = None,
-    noise: FloatArray | None = None,
-) -> Optimum | None:
-    """The minimum for noise from one of the error: weights, noise of outputs, parameters in turn.
-
-    corrects, process: as of ``Innovations``. noise: (n_outputs,), by which it is descended from
-    first, where what is seen at the optimum would be too much. None as of ``_refitted``.
-    """
-    # Of its free run: a filter's errors are in parts of noise that may be next to none.
-    chromosome, rms = optimum.chromosome, optimum.by(optimum.objective).rms
-    settings: dict[str, Any] = {"corrects": corrects, "process": process}
-    if noise is not None:
-        assumed = Innovations.of(optimum.objective, noise, near=chromosome, **settings)
-        weights = objective.weights * np.mean(assumed.scales, axis=0) / assumed.noise
-        assumed = assumed.eased(chromosome).weighed(weights)
-        chromosome = refine(assumed, chromosome, on_iteration=watch).chromosome
-    fitted = Innovations.starting(optimum.objective, chromosome, **settings)
-    last = np.zeros(len(fitted.noise))
-    too_well = _too_well(rms)
-    for _ in range(_NOISE_ROUNDS):
-        if not corrects and fitted.overwhelmed.any():
-            return None
-        rms = fitted.rms(chromosome[None])[0]
-        if not np.isfinite(rms).all():  # a filter needs more steps here than there may be
-            break
-        weighed = fitted.weighed(objective.weights / (too_well * np.maximum(rms, TINY)))
-        steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
-        end = refine(weighed, chromosome, on_iteration=watch)
-        chromosome, rms, fitted = end.chromosome, end.rms, weighed
-        if steady and not fitted.quiet:
-            break
-        if steady:
-            # Where it began neither what bends nor what parabolas miss could be told well.
-            anew = fitted.renewed(chromosome).eased(chromosome)
-            alike = np.allclose(anew.noise, fitted.noise, rtol=_RENEWED)
-            if alike and fitted.exact == anew.exact:
-                break
-            fitted = anew
-        else:
-            fitted, last = towards(fitted, fitted.settled(chromosome), last)
-    return Optimum.of(fitted, chromosome, rms)
-
-
-def _too_well(rms: FloatArray) -> FloatArray:
-    """By how much outputs are explained too well to count by what is left of them, (n_outputs,).
-
-    rms: of free runs' errors, for noise of the inputs may leave hardly anything of an innovation.
-    """
-    with np.errstate(over="ignore"):  # where simulations failed
-        factors: FloatArray = np.maximum(1.0, LEAST_SHARE * rms.max() / np.maximum(rms, TINY))
-    return factors
-
-
-def towards(
-    fitted: Innovations, settled: Innovations, last: FloatArray
-) -> tuple[Innovations, FloatArray]:
-    """With the noise of the next round, and by how much its logarithms change, (n_outputs,).
-
-    settled: with the noise that the parameters of this round ask for. last: change of the round
-    before. Where one undoes most of the other, noise and parameters would go to and fro for ever:
-    between the two is where a secant puts the end (Aitken).
-    """
-    change = np.log(settled.noise / fitted.noise)
-    part = np.divide(change, last, out=np.zeros_like(change), where=last != 0.0)
-    change = change / np.where(part < _SWINGING, 1.0 - part, 1.0)
-    return settled.of_noise(fitted.noise * np.exp(change)), change

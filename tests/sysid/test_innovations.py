@@ -2,8 +2,7 @@
 
 import itertools
 import math
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -28,7 +27,8 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi.excerpt import Excerpt
-from sysid.gassi.likelihood import better_by_filter, noisy_fit, towards
+from sysid.gassi.filter_search import better_by_filter
+from sysid.gassi.noise_fit import NoiseFit, towards
 from sysid.gassi.optima import Optimum
 from sysid.judging.examination import suspected, verdict_of
 from sysid.uncertainty import uncertainty
@@ -574,8 +574,7 @@ def test_intervals_count_how_well_the_outputs_noise_is_known():
     for record in itertools.islice(noisy_records(12, of_output=0.02), 0, None, 2):
         objective = Objective(BatchSimulator(lag(), accuracy=1e-4), SearchSpace.of(lag()), [record])
         truth = np.array([GAIN, TAU])
-        by_error = Optimum(objective, truth, objective.rms(truth[None])[0], feasible=True)
-        fit = noisy_fit(True, None, objective, by_error)
+        fit = NoiseFit(objective, objective, corrects=True)(truth)
         errors.append(np.log(fit.chromosome[1] / TAU))
         covariance = uncertainty(fit.objective, fit.chromosome).covariance
         stated.append(np.sqrt(covariance[1, 1]))
@@ -598,23 +597,33 @@ def test_a_filter_tells_where_noise_hides_the_bend_of_the_equations():
     assert share(lag(), 0.1) == 0.0
 
 
+@dataclass(frozen=True)
+class EndsAt(NoiseFit):
+    """A fit that ends where it is told, or cannot be made."""
+
+    end: Optimum | None = None
+
+    def __call__(self, chromosome, noise=None):
+        return self.end
+
+
 def test_a_filters_minimum_is_sought_all_over_where_innovations_can_be_foreseen():
     (record, _) = noisy_records(1)
     space = SearchSpace.of(lag())
     objective = Objective(BatchSimulator(lag(), accuracy=1e-4), space, [record])
     wrong = np.array([0.5 * GAIN, TAU])
-    by_error = Optimum(objective, wrong, objective.rms(wrong[None])[0], feasible=True)
     criterion = Innovations.starting(objective, wrong, corrects=True)
-    stuck = replace(by_error, objective=criterion, rms=criterion.rms(wrong[None])[0])
-    fit = partial(noisy_fit, True, None, objective)
-    better, _ = better_by_filter(fit, stuck, [], by_error, None)
-    from_truth = fit(replace(by_error, chromosome=np.array([GAIN, TAU])))
+    stuck = Optimum(criterion, wrong, criterion.rms(wrong[None])[0], feasible=True)
+    fit = NoiseFit(objective, objective, corrects=True)
+    better, _ = better_by_filter(fit, stuck, [])
+    from_truth = fit(np.array([GAIN, TAU]))
     assert better.chromosome == pytest.approx(from_truth.chromosome, rel=0.15)
     # Neither what cannot be fitted nor what is no better, and nothing where they are white.
-    assert better_by_filter(lambda optimum, watch: None, stuck, [wrong], by_error, None)[0] is stuck
-    assert better_by_filter(lambda optimum, watch: stuck, stuck, [], by_error, None)[0] is stuck
+    for end in (None, stuck):
+        nowhere = EndsAt(objective, objective, corrects=True, end=end)
+        assert better_by_filter(nowhere, stuck, [wrong])[0] is stuck
     rest = [wrong]
-    assert better_by_filter(fit, from_truth, rest, by_error, None) == (from_truth, rest)
+    assert better_by_filter(fit, from_truth, rest) == (from_truth, rest)
 
 
 @pytest.mark.soak
@@ -628,11 +637,11 @@ def test_an_output_whose_error_is_all_of_an_inputs_noise_counts_like_the_others(
     record = Dataset(noisy, y, DT, input_noise=np.array([OF_INPUT, 0.0]))
     objective = Objective(BatchSimulator(two_lags()), SearchSpace.of(two_lags()), [record])
     start = np.array([GAIN, 1.3 * TAU])
-    by_error = Optimum(objective, start, objective.rms(start[None])[0], feasible=True)
-    fit = noisy_fit(True, None, objective, by_error)
+    begin = NoiseFit(objective, objective, corrects=True)
+    fit = begin(start)
     assert fit.rms[0] < 1e-3 * fit.rms[1]
     # Nor does it count for less where a fit goes on from a filter's minimum.
-    again = noisy_fit(True, None, objective, replace(fit, objective=objective))
+    again = begin(fit.chromosome)
     for each in (fit, again):
         parts = each.objective.weights * each.rms
         assert parts[0] == pytest.approx(parts[1], rel=0.01)

@@ -16,7 +16,7 @@ from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi.likelihood import fit_likelihood
 from sysid.gassi.lookalikes import lookalikes
-from sysid.gassi.slide import slid
+from sysid.gassi.slide import centred, slid
 from sysid.problem.space import SearchSpace
 from sysid.response.linearization import jacobian
 from sysid.uncertainty import uncertainty
@@ -446,6 +446,17 @@ def test_a_tied_value_is_moved_from_an_end_on_which_only_the_tie_has_left_it():
     assert not target.space.on_bound(optimum.chromosome).any()
     product = at_the_end.chromosome[0] * at_the_end.chromosome[1]
     assert (a * b, tau) == pytest.approx((product, at_the_end.chromosome[2]), rel=1e-3)
+
+
+def test_a_minimum_is_moved_to_the_middle_of_its_tie_and_stays_one():
+    target = objective_of(PRODUCT_LAG, record_of(PRODUCT_LAG, 0.01, noise=0.02))
+    minimum = refine(target, np.array([8.0, 0.25, 0.05]))
+    a, b, tau = centred(target, minimum.chromosome).chromosome
+    assert a == pytest.approx(b, rel=1e-2)  # both may be 0.1 to 10
+    product = minimum.chromosome[0] * minimum.chromosome[1]
+    assert (a * b, tau) == pytest.approx((product, minimum.chromosome[2]), rel=1e-3)
+    alone = objective_of(lags(), record_of(lags(), 0.01, noise=0.02))
+    assert centred(alone, np.array([0.03, 0.12])) is None
 
 
 def test_a_tied_value_stays_on_an_end_that_the_data_want_it_beyond():
