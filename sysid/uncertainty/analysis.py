@@ -544,13 +544,16 @@ class _Analysis:
     ) -> BoolArray:
         """Parameters, (n_free,), on an end of their range that decides nothing.
 
-        places: of those for which that is asked, default all.
+        Nor do all such ends together. places: of those for which that is asked, default all.
         """
         harmless = self.on_bound & ~self.pushed
         if places is not None:
             harmless &= np.isin(np.arange(len(harmless)), places)
         for j in np.flatnonzero(harmless).tolist():
-            harmless[j] = self._range_ends.decides_nothing(j, estimates)
+            harmless[j] = self._range_ends.decide_nothing([j], estimates)
+        together = np.flatnonzero(harmless).tolist()
+        if len(together) > 1 and not self._range_ends.decide_nothing(together, estimates):
+            harmless[:] = False
         return harmless
 
     @cached_property

@@ -36,22 +36,23 @@ class RangeEnds:
     changes: Callable[[FloatArray], Mapping[str, float]]
     deviations: Mapping[str, float]
 
-    def decides_nothing(self, j: int, estimates: Sequence[Estimate]) -> bool:
-        """Whether beyond the end of parameter j all else would be estimated alike.
+    def decide_nothing(self, places: Sequence[int], estimates: Sequence[Estimate]) -> bool:
+        """Whether beyond the ends of some parameters all else would be estimated alike.
 
         Or be where its interval has no end. By the slopes, as where ties would lead inside again;
         or by a run beyond, as where a parameter does next to nothing at that end, and the slope
         over its logarithm would lead far.
         """
         space, held = self.local.objective.space, self.on_bound.copy()
-        combined = [e for e in estimates if e.combination and space.names[j] in e.combination.names]
+        names = {space.names[j] for j in places}
+        combined = [e for e in estimates if e.combination and names & {*e.combination.names}]
         if any(estimate.why == "end" for estimate in combined):
             return False
-        held[j] = False
-        others = [estimate for estimate in estimates if estimate.name != space.names[j]]
+        held[places] = False
+        others = [estimate for estimate in estimates if estimate.name not in names]
         if self._alike(self._by_slopes(self._with(held)), others):
             return True
-        beyond = self._beyond(j)
+        beyond = self._beyond(places)
         return beyond is not None and self._alike(beyond, others)
 
     def opened(self, free: Covariance, estimates: Sequence[Estimate]) -> list[Estimate]:
@@ -90,19 +91,15 @@ class RangeEnds:
         """Inverse curvature, (n_free, n_free), of all that stand on no end."""
         return self._with(self.on_bound).curvature
 
-    def _beyond(self, j: int) -> FloatArray | None:
-        """Search coordinates, (n_free,), of the minimum with parameter j beyond its end.
+    def _beyond(self, places: Sequence[int]) -> FloatArray | None:
+        """Search coordinates, (n_free,), of the minimum with parameters beyond their ends.
 
         Those that stand on no end follow by their slopes. None where a simulation fails beyond.
         """
-        local, objective, at = self.local, self.local.objective, self.local.chromosome
+        local, objective, there = self.local, self.local.objective, self.local.chromosome.copy()
         space = objective.space
-        low = space.encode(at)[j] - space.coded_lower[j] < 0.5 * space.width[j]
-        beyond = at[j] / _FACTOR if low else at[j] * _FACTOR
-        if not space.log[j]:
-            beyond = at[j] + (-space.width[j] if low else space.width[j])
-        there, parameter = at.copy(), space.parameters[j]
-        there[j] = min(max(beyond, parameter.minimum), parameter.maximum)
+        for j in places:
+            there[j] = self._value_beyond(j)
         residual = local.share * objective.residuals(there[None], local.steps).values[..., 0]
         if not np.all(np.isfinite(residual)):
             return None
@@ -110,6 +107,17 @@ class RangeEnds:
         push = np.einsum("tip,i,ti->p", local.slopes, weights, residual - local.residual)
         minimum: FloatArray = space.encode(there) - self._inverse @ push
         return minimum
+
+    def _value_beyond(self, j: int) -> float:
+        """A value of parameter j well beyond the end on which it stands."""
+        space, value = self.local.objective.space, float(self.local.chromosome[j])
+        coded = float(space.encode(self.local.chromosome)[j])
+        low = coded - space.coded_lower[j] < 0.5 * space.width[j]
+        beyond = value / _FACTOR if low else value * _FACTOR
+        if not space.log[j]:
+            beyond = value + float(-space.width[j] if low else space.width[j])
+        parameter = space.parameters[j]
+        return min(max(beyond, parameter.minimum), parameter.maximum)
 
     def _alike(self, point: FloatArray, estimates: Sequence[Estimate]) -> bool:
         """Whether quantities at a point, (n_free,), are as estimated, or on a side without end."""

@@ -735,6 +735,23 @@ def test_an_end_beyond_which_nothing_changes_is_harmless(low, harmless):
     assert (moved < 0.5) is harmless
 
 
+def test_ends_that_decide_something_together_are_not_harmless():
+    """A tenfold of b or of c is nothing, of both a hundredfold, by which a is another."""
+
+    def formula(p, u):
+        return columns(p["a"] * u[:, 0] + 6e-4 * p["b"] * p["c"] * (u[:, 0] + 0.03 * u[:, 1]))
+
+    parameters = [unknown(name, value) for name, value in (("a", 3.0), ("b", 10.0), ("c", 10.0))]
+    problem, low = Problem(formula, parameters, seed=2), (0.1, 1.0)
+    for ends, fixed in (({"b": low, "c": low}, {}), ({"b": low}, {"c": 1.0})):
+        ended = estimates(problem.tell(ranges=ends, fixed=fixed))
+        at_ends = [e for e in ended.values() if e.on_bound]
+        assert [e.name for e in at_ends] == [*ends] and not any(e.pushed for e in at_ends)
+        assert all(e.harmless is (len(ends) == 1) for e in at_ends)
+    free = estimates(problem.tell(fixed={"b": 10.0, "c": 10.0}))
+    assert abs(ended["a"].value - free["a"].value) > 0.5 * ended["a"].deviation
+
+
 def test_where_ranges_of_tied_parameters_end_a_profile_there_is_no_end():
     """R / L is known, so with R / K it ends at the least L and the largest K."""
 
