@@ -23,7 +23,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from sysid.engine.batch_kernel import BatchKernel
 from sysid.engine.filter_kernel import FilterKernel
-from sysid.engine.sample_kernel import SampleKernel
+from sysid.engine.sample_kernel import IntervalKernel, SampleKernel
 from sysid.engine.structure import analyse
 from sysid.engine.substitution import KNOWN_MODULES, Copier, names_in
 from sysid.engine.tangent import TangentKernel
@@ -98,15 +98,14 @@ def kalman_filter(
     driven: tuple[int, ...] = (),
     averaged: tuple[int, ...] = (),
     coloured: bool = False,
-    moved: tuple[int, ...] = (),
 ) -> Filter:
     """Compile a model's filter for noise on some inputs and states; as ``kernels``.
 
     noisy, driven: their places; averaged: places of outputs, as of ``FilterKernel``, whose model
-    is ``with_integrals`` of them; coloured: whether the inputs' noise may be; moved: places of
-    parameters, as of ``variation``. Raises ModelError for equations that cannot be differentiated.
+    is ``with_integrals`` of them; coloured: whether the inputs' noise may be. Raises ModelError for
+    equations that cannot be differentiated.
     """
-    varied = variation(model, noisy, driven, moved)
+    varied = variation(model, noisy, driven)
     kernel = FilterKernel(model, varied, averaged, coloured=coloured)
     text = f"{kernel.structure.program}\n\n{kernel.text()}"
     return Filter(model, kernel, *_compiled(model, text, {}, ("innovations",)))
@@ -146,9 +145,18 @@ class SampleLanes:
 @_once
 def sample_lanes(model: ProcessModel) -> SampleLanes:
     """Compile what advances lanes of a model sample by sample; as ``kernels``."""
+    return _sample_lanes(model, SampleKernel(model, analyse(model)))
+
+
+@_once
+def interval_lanes(model: ProcessModel) -> SampleLanes:
+    """Compile what advances lanes of a model over many samples; as ``kernels``."""
+    return _sample_lanes(model, IntervalKernel(model, analyse(model)))
+
+
+def _sample_lanes(model: ProcessModel, kernel: SampleKernel) -> SampleLanes:
     from sysid.engine.intrinsics import many_registers
 
-    kernel = SampleKernel(model, analyse(model))
     text = f"{kernel.structure.program}\n\n{kernel.text(many_registers=many_registers())}"
     called = {name: getattr(model, name) for name in sorted(kernel.structure.calls)}
     functions = _compiled(model, text, called, ("prepare", "advance"))

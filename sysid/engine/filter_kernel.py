@@ -89,11 +89,11 @@ class FilterKernel(BatchKernel):
             *[f"seen{j} = 1.0 if w{j} > 0.0 else 0.0" for j in outputs],
             *self._traced("before"),
             *block(EACH_LANE, self._corrected()),
+            *self._traced("after"),
             *block("if k == n_samples - 1:", ["break"]),
             *self._input_slopes(),
             *block(EACH_LANE, self._undisturbed()),
             *block("for step in range(n_steps):", self._stage_inputs(), self._all_lanes(False)),
-            *self._traced("behind"),
             *block(EACH_LANE, self._predicted()),
         ]
         sums = f"sums[j, l] = X[({self._sums} + j) * {LANES} + l]"
@@ -109,12 +109,12 @@ class FilterKernel(BatchKernel):
         ]
         head = (
             "def innovations(X, rows, tables, u, y, w, r, unit, mean, s, colour, intensity, "
-            "spread, corrects, start, p, dt, n_steps, sums, record, before, behind):"
+            "spread, corrects, start, p, dt, n_steps, sums, record, before, after):"
         )
         return "\n".join(block(head, body))
 
     def _traced(self, table: str) -> list[str]:
-        """Keep the first lane's work area, before a sample's outputs or behind its interval."""
+        """Keep the first lane's work area, before a sample's outputs or after them."""
         rows = block(f"for i in range({table}.shape[1]):", [f"{table}[k, i] = X[i * {LANES}]"])
         return block(f"if k < {table}.shape[0]:", rows)
 
@@ -212,10 +212,10 @@ class FilterKernel(BatchKernel):
         row: dict[int, str] = {}
         for place, (output, k) in enumerate(self.variation.gains):
             if output == j:
-                row[self.place_of(k)] = "" if self.output_states is not None else f"g{place}"
+                row[self._place_of(k)] = "" if self.output_states is not None else f"g{place}"
         return row
 
-    def place_of(self, k: int) -> int:
+    def _place_of(self, k: int) -> int:
         """Place in P of a state, or behind the model's states of a noisy input."""
         behind = k - self.variation.n_states
         return self.reached.index(k) if behind < 0 else len(self.reached) + behind

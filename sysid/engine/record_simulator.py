@@ -9,7 +9,8 @@ from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.bends import in_parts, splines_of, with_bends
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
 from sysid.engine.filter_kernel import FilterKernel
-from sysid.engine.filter_response import FilterResponse, filter_response
+from sysid.engine.intervals import Intervals, IntervalSlopes
+from sysid.engine.linear_response import LinearResponse, filter_response
 from sysid.engine.scheme import LANES, work_area
 from sysid.engine.windows import (
     Ends,
@@ -215,7 +216,7 @@ class RecordSimulator:
         what free runs say, of outputs that are no parabolas between samples; beyond: (n_samples,
         n_outputs, n), what these say, where it is known. A state that starts at the first sample
         of an output has that sample's error. traces: filled with the kernel's work area before
-        each sample, (n_samples, work_rows), and behind it, (n_samples, n_states). Returns with the
+        each sample's outputs, (n_samples, work_rows), and its states after them. Returns with the
         sums of squares those of the logarithms of the innovations' variances in parts of the
         outputs', (n, n_outputs).
         """
@@ -279,23 +280,26 @@ class RecordSimulator:
         vector: FloatArray,
         start: FloatArray,
         n_steps: int,
-    ) -> FilterResponse:
+    ) -> LinearResponse:
         """How innovations answer disturbances under parameters (n_parameters,) from a start.
 
-        kalman: with every state driven. Other arguments as of ``innovations``.
+        Other arguments as of ``innovations``.
         """
-        kernel, n = kalman.kernel, self.record.n_samples
-        before, behind = np.zeros((n, kernel.work_rows)), np.zeros((n, kernel.n_states))
+        kernel, record = kalman.kernel, self.record
+        n, n_states = record.n_samples, kernel.variation.n_states
+        before, after = np.zeros((n, kernel.work_rows)), np.zeros((n, n_states))
         values = np.empty((n, len(noise), 1))
         self.innovations(
             kalman, noise, scatter, trust, process, colour, corrects, exact, beyond,
             vector[None], start[None], np.zeros(1, dtype=np.int64), n_steps, values,
-            (before, behind),
+            (before, after),
         )  # fmt: skip
-        (mean, _), weights = self._taken_in(kernel, trust, corrects)
+        intervals = Intervals(kalman.model, vector, record.inputs, record.dt, n_steps)
+        mean, _ = self._means(self.averaged, corrects)
         return filter_response(
-            kalman.model, kernel, before, behind, mean, weights, noise**2 + scatter, noise**2,
-            colour[list(kernel.variation.noisy)], corrects, self.record.inputs, vector,
+            kernel, self.averaged, IntervalSlopes(intervals, after), before, mean,
+            self._taken_in(kernel, trust, corrects)[1], noise**2 + scatter, noise**2,
+            colour[list(kernel.variation.noisy)], corrects,
         )  # fmt: skip
 
     def tangents(

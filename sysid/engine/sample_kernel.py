@@ -26,11 +26,13 @@ class SampleKernel(BatchKernel):
         prepare = block(
             "def prepare(X, rows, tables, start, p, h):", ["wide_vectors()", *self._begin()]
         )
-        head = ["wide_vectors()", "share = 1.0 / n_steps", *STEP_SIZES]
         lanes = self._all_lanes(many_registers or bool(self.structure.coefficients))
         steps = block("for step in range(n_steps):", lanes)
-        advance = block("def advance(X, U, h, n_steps):", head, steps)
-        return "\n\n".join("\n".join(lines) for lines in (prepare, advance))
+        head = ["wide_vectors()", "share = 1.0 / n_steps", *STEP_SIZES]
+        return "\n\n".join("\n".join(lines) for lines in (prepare, self._advance(head, steps)))
+
+    def _advance(self, head: list[str], steps: list[str]) -> list[str]:
+        return block("def advance(X, U, h, n_steps):", head, steps)
 
     def _inputs_of_lane(self) -> list[str]:
         lines = [f"v{j} = {input_at(j)}" for j in range(self.n_inputs)]
@@ -40,6 +42,26 @@ class SampleKernel(BatchKernel):
 
     def _estimate(self) -> list[str]:
         return []
+
+
+class IntervalKernel(SampleKernel):
+    """The same with an ``advance`` over many samples, in a row or each by itself.
+
+    inputs: (n_samples, size of U). starts: states, (n, n_states * LANES), of the first n samples;
+    each sample behind them begins where the one before it ended. ends: (n_samples, n_states *
+    LANES), to be filled.
+    """
+
+    def _advance(self, head: list[str], steps: list[str]) -> list[str]:
+        every = f"for i in range({self.n_states * LANES}):"
+        sample = [
+            "U = inputs[k]",
+            *block("if k < starts.shape[0]:", block(every, ["X[i] = starts[k, i]"])),
+            *steps,
+            *block(every, ["ends[k, i] = X[i]"]),
+        ]
+        samples = block("for k in range(inputs.shape[0]):", sample)
+        return block("def advance(X, starts, inputs, h, n_steps, ends):", head, samples)
 
 
 def input_at(row: int) -> str:

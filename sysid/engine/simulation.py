@@ -11,7 +11,7 @@ import numpy as np
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.bends import bent
 from sysid.engine.compiler import Filter, kalman_filter, kernels, tangents
-from sysid.engine.filter_response import FilterResponse
+from sysid.engine.linear_response import LinearResponse
 from sysid.engine.record_simulator import RecordSimulator, blocks_of
 from sysid.engine.scheme import LANES
 from sysid.engine.windows import with_integrals
@@ -242,7 +242,7 @@ class BatchSimulator:
         ModelError for equations that cannot be differentiated.
         """
         process = np.zeros(len(self.model.states)) if process is None else process
-        driven = tuple(np.flatnonzero(process).tolist())
+        driven = _driven(process)
         white = np.zeros((len(records), len(self.model.inputs)))
         colours = white if colour is None else np.asarray(colour)
         kalman = self._filter(records, driven, bool(colours.any()))
@@ -292,16 +292,13 @@ class BatchSimulator:
         corrects: bool,
         exact: bool,
         beyond: FloatArray | None,
-    ) -> FilterResponse:
+    ) -> LinearResponse:
         """How innovations of a record answer what is added to the equations and the outputs.
 
         Of one parameter vector, (n_parameters,), from one start, (n_states,). Other arguments as of
         ``innovations``, for one record.
         """
-        states, moved = (
-            tuple(range(len(part))) for part in (self.model.states, self.model.parameters)
-        )
-        kalman = self._filter([record], states, bool(colour.any()), moved)
+        kalman = self._filter([record], _driven(process), bool(colour.any()))
         return self._on(record, scale).filter_response(
             kalman, noise, scatter, trust, process, colour, corrects, exact, beyond, vector, start,
             n_steps,
@@ -312,12 +309,11 @@ class BatchSimulator:
         records: Sequence[Dataset],
         driven: tuple[int, ...],
         coloured: bool,
-        moved: tuple[int, ...] = (),
     ) -> Filter:
         averaged = tuple(sorted({j for record in records for j in self._on(record).averaged}))
         model = bent(self.model) if all(record.between.size for record in records) else self.model
         model = with_integrals(model, averaged) if averaged else model
-        return kalman_filter(model, noisy_inputs(records), driven, averaged, coloured, moved)
+        return kalman_filter(model, noisy_inputs(records), driven, averaged, coloured)
 
     def beyond_parabolas(
         self,
@@ -490,6 +486,11 @@ class BatchSimulator:
 def _each_beside(points: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points (n, m) repeated for each of their directions (n, d, m), and these, (n d, m) each."""
     return np.repeat(points, directions.shape[1], axis=0), directions.reshape(-1, points.shape[1])
+
+
+def _driven(process: FloatArray) -> tuple[int, ...]:
+    """Places of the states that noise of the process, (n_states,), drives."""
+    return tuple(np.flatnonzero(process).tolist())
 
 
 def noisy_inputs(records: Sequence[Dataset]) -> tuple[int, ...]:

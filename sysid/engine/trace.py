@@ -119,23 +119,34 @@ def evaluated(function: Any, *sides: FloatArray) -> FloatArray:
     return np.stack([rows + value for value in values], axis=1)
 
 
-def rates_along(
-    derivative: Callable[..., Any], states: FloatArray, inputs: FloatArray, parameters: FloatArray
+def values_along(
+    function: Callable[..., Any],
+    n_values: int,
+    states: FloatArray,
+    inputs: FloatArray,
+    parameters: FloatArray,
 ) -> FloatArray:
-    """A model's rates along a run, (n_samples, n_states), NaN where they fail.
+    """Values of a model's function along a run, (n_samples, n_values), NaN where it fails.
 
     states: (n_samples, n_states); inputs: (n_samples, n_inputs); parameters: (n_parameters,).
     """
     with suppress(Exception):  # it may do more than can be followed at many points at once
-        return evaluated(derivative, states, inputs, parameters[None])
+        return evaluated(function, states, inputs, parameters[None])
     p = tuple(parameters.tolist())
-    rates = np.full(states.shape, np.nan)
-    for row, x, u in zip(rates, states.tolist(), inputs.tolist(), strict=True):
+    values = np.full((len(states), n_values), np.nan)
+    for row, x, u in zip(values, states.tolist(), inputs.tolist(), strict=True):
         try:
-            row[:] = derivative(tuple(x), tuple(u), p)
+            row[:] = function(tuple(x), tuple(u), p)
         except (ArithmeticError, ValueError):
             continue
-    return rates
+    return values
+
+
+def rates_along(
+    derivative: Callable[..., Any], states: FloatArray, inputs: FloatArray, parameters: FloatArray
+) -> FloatArray:
+    """A model's rates along a run, (n_samples, n_states), as of ``values_along``."""
+    return values_along(derivative, states.shape[1], states, inputs, parameters)
 
 
 def traces(tape: Tape, letter: str, count: int) -> tuple[Trace, ...]:

@@ -28,8 +28,8 @@ from sysid.problem.model import Function, ModelError, ProcessModel
 
 # What a column of deviations comes from: a deviation of a state at the start of the interval, or
 # an input's error at the sample where it starts, or at that where it ends, or a state's rate
-# throughout the interval, or one that rises from 0 to 1, or a parameter that is another.
-Cause = tuple[Literal["state", "begin", "end", "level", "slope", "parameter"], int]
+# throughout the interval, or one that rises from 0 to 1.
+Cause = tuple[Literal["state", "begin", "end", "level", "slope"], int]
 _OF_RATES = ("level", "slope")
 _Slopes = Mapping[tuple[int, int], str]
 
@@ -56,33 +56,26 @@ class Variation:
     gains: tuple[tuple[int, int], ...]
 
 
-def variation(
-    model: ProcessModel,
-    noisy: Sequence[int],
-    driven: Sequence[int] = (),
-    moved: Sequence[int] = (),
-) -> Variation:
+def variation(model: ProcessModel, noisy: Sequence[int], driven: Sequence[int] = ()) -> Variation:
     """The equations of a model and of the deviations that noise causes.
 
-    noisy: places of inputs with noise. driven: places of states with noise of the process. moved:
-    places of parameters whose moves have deviations as well. Raises
+    noisy: places of inputs with noise. driven: places of states with noise of the process. Raises
     ModelError for equations that cannot be differentiated without a point: those that branch, look
     up or call what has no known derivative.
     """
     n, m = len(model.states), len(model.inputs)
     tape = Tape()
-    rates, slopes = _differentiated(model, tape, model.derivative, noisy, moved)
+    rates, slopes = _differentiated(model, tape, model.derivative, noisy)
     gains: _Slopes = dict.fromkeys(enumerate(model.output_states or ()), "1.0")
     outputs: list[str] | None = None
     if model.output is not None:
         outputs, gains = _differentiated(model, tape, model.output, noisy)
     reached = tuple(sorted(_reached(slopes, n, noisy, driven) & _telling(slopes, gains, n)))
     causes = _causes(model, reached, noisy, driven)
-    causes += [("parameter", k) for k in range(len(moved))]
     columns: dict[Cause, dict[int, int]] = {}
     place = n
     for cause in causes:
-        rows = _moved(slopes, reached, cause, n, len(noisy))
+        rows = _moved(slopes, reached, cause, n)
         columns[cause] = {i: place + k for k, i in enumerate(rows)}
         place += len(rows)
     rising = f"u{m}"
@@ -90,10 +83,8 @@ def variation(
     for cause, column in columns.items():
         kind, k = cause
         held = kind == "begin" and model.inputs[noisy[k]].hold == "zoh"
-        level = held or kind in ("level", "parameter")
-        share = "1.0" if level else falling if kind == "begin" else rising
-        source = _source(cause, n, len(noisy))
-        rates += [_rate(tape, slopes, cause, source, column, i, share) for i in column]
+        share = "1.0" if held or kind == "level" else falling if kind == "begin" else rising
+        rates += [_rate(tape, slopes, cause, column, i, n, share) for i in column]
     telling = {k: name for k, name in sorted(gains.items()) if k[1] >= n or k[1] in reached}
     splitter = Splitter()
     rows_of = splitter.split(tape, rates)
@@ -106,15 +97,10 @@ def variation(
 
 
 def _differentiated(
-    model: ProcessModel,
-    tape: Tape,
-    function: Function,
-    noisy: Sequence[int],
-    moved: Sequence[int] = (),
+    model: ProcessModel, tape: Tape, function: Function, noisy: Sequence[int]
 ) -> tuple[list[str], _Slopes]:
-    """A function's values on a tape, and their slopes over states, noisy inputs and parameters."""
+    """A function's values on a tape, and their slopes over states and then noisy inputs."""
     variables = [f"x{i}" for i in range(len(model.states))] + [f"u{j}" for j in noisy]
-    variables += [f"p{k}" for k in moved]
     try:
         names = traced(tape, model, function)
         moves = {name: {k: "1.0"} for k, name in enumerate(variables)}
@@ -144,20 +130,11 @@ def _telling(slopes: _Slopes, gains: _Slopes, n: int) -> set[int]:
     return _closed({k for _, k in gains if k < n}, ((i, k) for i, k in slopes if k < n))
 
 
-def _source(cause: Cause, n: int, n_noises: int) -> int:
-    """Place of what a cause acts through among states, noisy inputs and parameters."""
-    kind, k = cause
-    return k + {"begin": n, "end": n, "parameter": n + n_noises}.get(kind, 0)
-
-
-def _moved(
-    slopes: _Slopes, reached: Sequence[int], cause: Cause, n: int, n_noises: int
-) -> list[int]:
+def _moved(slopes: _Slopes, reached: Sequence[int], cause: Cause, n: int) -> list[int]:
     """States that a cause moves, among those that are reached."""
     kind, k = cause
     direct = kind == "state" or kind in _OF_RATES
-    source = _source(cause, n, n_noises)
-    first = {k} if direct else {i for i, j in slopes if j == source}
+    first = {k} if direct else {i for i, j in slopes if j == n + k}
     moved = _closed(first & {*reached}, ((j, i) for i, j in slopes if i in reached and j < n))
     return [i for i in reached if i in moved]
 
@@ -184,15 +161,9 @@ def _causes(
 
 
 def _rate(
-    tape: Tape,
-    slopes: _Slopes,
-    cause: Cause,
-    source: int,
-    column: Mapping[int, int],
-    i: int,
-    share: str,
+    tape: Tape, slopes: _Slopes, cause: Cause, column: Mapping[int, int], i: int, n: int, share: str
 ) -> str:
-    """Rate of the deviation of state i by a cause; share: of it that acts, source: through what."""
+    """Rate of the deviation of state i by a cause; share: of an input's error that acts now."""
     total: str | None = None
     for j, place in column.items():
         if (i, j) in slopes:
@@ -200,6 +171,6 @@ def _rate(
     kind, k = cause
     if kind in _OF_RATES and i == k:
         total = tape.join("+", total, share)
-    if kind in ("begin", "end", "parameter") and (i, source) in slopes:
-        total = tape.join("+", total, tape.multiply(slopes[i, source], share))
+    if kind in ("begin", "end") and (i, n + k) in slopes:
+        total = tape.join("+", total, tape.multiply(slopes[i, n + k], share))
     return total or "0.0"

@@ -35,7 +35,7 @@ from typing import Any, Self
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.engine.filter_response import FilterResponse
+from sysid.engine.linear_response import LinearResponse
 from sysid.engine.simulation import BatchResult, Residuals, Status
 from sysid.fitting.averages import coloured, denoised
 from sysid.fitting.means import each_mean_once, scatter
@@ -513,7 +513,7 @@ class Innovations(Objective):
         np.divide(scaled, free_run, out=share, where=free_run != 0.0)
         return share
 
-    def response(self, chromosome: FloatArray, place: int, n_steps: int) -> FilterResponse:
+    def response(self, chromosome: FloatArray, place: int, n_steps: int) -> LinearResponse:
         """How innovations of the record at a place answer disturbances, at (n_free,).
 
         Changes are in parts of the outputs' scales.

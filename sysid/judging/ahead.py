@@ -10,6 +10,7 @@ from sysid.fitting.reactions import with_reactions
 from sysid.judging.disturbed import DisturbedRun
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
+from sysid.threads import Workers
 
 _SAMPLES = 32
 
@@ -18,7 +19,7 @@ def compile_ahead(model: ProcessModel, record: Dataset) -> None:
     """Leave in the cache folder what a fit to a record needs behind its search.
 
     A filter for noise of its inputs, plain simulations of outputs that are means over windows, and
-    the model with what may be missing added. The search's own kernels are left to the search.
+    the intervals by which score tests tell what may be missing. The search's own kernels are left to the search.
 
     >>> from sysid.examples import lag, lag_record
     >>> compile_ahead(lag(), lag_record())
@@ -32,7 +33,7 @@ def compile_ahead(model: ProcessModel, record: Dataset) -> None:
             bent, noise = with_reactions(model, head, vector, start), np.ones(len(model.outputs))
             simulator.innovations(vector[None], [bent], [noise], n_steps, [None], noise)
     with suppress(ModelError):
-        DisturbedRun(model, vector, head, start)
+        DisturbedRun.free(model, vector, head, start, 1, Workers(1))
     with suppress(ModelError):
         if head.windows.size:
             simulator.errors(vector[None], [replace(head, windows=np.zeros(0))])

@@ -54,7 +54,7 @@ def of_free_runs(local: Sensitivity) -> tuple[Sensitivity, list[DisturbedRun], B
     workers, runs = Workers(objective.simulator.threads), []
     for k, record in enumerate(objective.records):
         start = objective.space.starts(chromosomes, k, record.initial_state(model))[0]
-        runs.append(DisturbedRun(model, vector, record, start, workers))
+        runs.append(DisturbedRun.free(model, vector, record, start, local.steps[k], workers))
     scales, none = objective.scales_of_each, np.zeros(local.residual.shape)
     zeros = np.stack([none, *(zero * scales for zero in zero_errors(local))], axis=2)
     return (

@@ -6,14 +6,13 @@ they would do is bent. A filter knows where the plant is, and its innovations ar
 """
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.engine.filter_response import FilterResponse, slope_of
-from sysid.engine.trace import evaluated, rates_along
+from sysid.engine.linear_response import LinearResponse, observed, slope_of
 from sysid.engine.windows import average
 from sysid.fitting.innovations import Innovations
 from sysid.judging.disturbed import DisturbedRun, shifted
@@ -27,13 +26,12 @@ class FilteredRun(DisturbedRun):
     """A filter's run of a record under parameters (n_parameters,), and what disturbances change.
 
     As a free run, with changes of the innovations, in the outputs' units, for those of the outputs.
-    response: of the filter; scale: (n_outputs,), of the innovations in it; of_noise: (n_inputs,),
+    scale: (n_outputs,), of the innovations in the response; of_noise: (n_inputs,),
     the inputs' colour. states: (n_samples, n_states), what the filter foresees at each sample from
     those before, so that no function of it is of what was measured then; outputs: that over the
     record's windows.
     """
 
-    response: FilterResponse
     scale: FloatArray
     of_noise: FloatArray
 
@@ -43,7 +41,7 @@ class FilteredRun(DisturbedRun):
         objective: Innovations,
         chromosome: FloatArray,
         place: int,
-        response: FilterResponse,
+        response: LinearResponse,
         workers: Workers,
     ) -> Self:
         """The run of the record at a place; response: of its filter."""
@@ -53,16 +51,11 @@ class FilteredRun(DisturbedRun):
             objective.space.full(chromosome[None])[0],
             record,
             record.initial_state(model),
+            response,
             workers,
-            response=response,
             scale=objective.scales[place],
             of_noise=objective.colour[place],
         )
-
-    def __post_init__(self) -> None:
-        self.states = self.response.states
-        self.outputs = self.over(self.record.windows)
-        self.rates = self.rates_of(self.model.derivative, self.vector)
 
     @property
     def colour(self) -> FloatArray:
@@ -79,9 +72,7 @@ class FilteredRun(DisturbedRun):
     @cached_property
     def instants(self) -> FloatArray:
         """Outputs of these states at their instants, (n_samples, n_outputs)."""
-        if self.model.output is None:
-            return self.states[:, list(self.model.output_states or ())]
-        return self._observed(0.0, 0.0)
+        return self._observed(np.zeros_like(self.vector))
 
     def averaged(self, j: int, signal: FloatArray) -> FloatArray:
         """A change (n_samples,) of output j at its instants as its sensor averages it."""
@@ -103,73 +94,30 @@ class FilteredRun(DisturbedRun):
         """Windows of output j, (n_samples, 2); none where all are sampled at their instants."""
         return self.record.windows[:, j] if self.record.windows.size else np.zeros(0)
 
-    def added(self, rates: FloatArray) -> FloatArray:
-        """Change per unit of what is added to the rates, both (n_samples, ...)."""
-        return self._finite(self.response.of(rates=rates))
-
-    def driven(self, inputs: FloatArray) -> FloatArray:
-        """Change per unit of a change of the inputs, (n_samples, n_inputs)."""
-        rates, held = np.zeros(self.states.shape), np.zeros(self.states.shape)
-        for i in np.flatnonzero(np.any(inputs != 0.0, axis=0)).tolist():
-            part = self._slopes[i] * inputs[:, [i]]
-            if self.model.inputs[i].hold == "zoh":
-                held += part
-            else:
-                rates += part
-        outputs = None
-        if self.model.output is not None:
-            outputs = self._through(inputs)
-        return self._finite(self.response.of(rates=rates, held=held, outputs=outputs))
-
     def logged(self, outputs: FloatArray) -> FloatArray:
         """Change by what is logged of the outputs beside what was foreseen, (n_samples, ...)."""
-        return self._finite(self.response.of(outputs=outputs))
-
-    def started(self, place: int) -> FloatArray:
-        """Change per unit of where a state starts, (n_samples, n_outputs)."""
-        return self._finite(self.response.of(start=np.eye(self.states.shape[1])[place]))
+        return self._change(self.response.of(outputs=outputs))
 
     def moved(self, vector: FloatArray, start: FloatArray) -> FloatArray:
         """Change by a change of the parameters (n_parameters,), and of the states' start."""
         outputs = None
         if self.model.output is not None:
             outputs = self._by_observation(vector)
-        return self._finite(self.response.of(vector=vector, start=start, outputs=outputs))
+        return self._change(self.response.of(vector=vector, start=start, outputs=outputs))
 
     def _by_observation(self, vector: FloatArray) -> FloatArray:
         """Change of the outputs by that of the parameters in the output function itself."""
         size = np.max(np.abs(vector) / np.maximum(np.abs(self.vector), 1e-300), initial=0.0)
         if not size:
             return np.zeros(self.record.outputs.shape)
-        return slope_of(lambda part: self._observed(0.0, part * vector), _SMALL / size)
+        return slope_of(lambda part: self._observed(part * vector), _SMALL / size)
 
-    @cached_property
-    def _slopes(self) -> list[FloatArray]:
-        """Slopes of the rates over each input, (n_samples, n_states) each."""
-        slopes = []
-        for i in range(self.record.inputs.shape[1]):
-            step = _SMALL * (float(np.abs(self.record.inputs[:, i]).max()) or 1.0)
-            slopes.append(slope_of(partial(self._rates_by, i), step))
-        return slopes
+    def _observed(self, vector: FloatArray) -> FloatArray:
+        """Outputs of the states at their instants with something added to the parameters."""
+        return observed(self.model, self.states, self.record.inputs, self.vector + vector)
 
-    def _rates_by(self, i: int, step: float) -> FloatArray:
-        inputs = self.record.inputs.copy()
-        inputs[:, i] += step
-        return rates_along(self.model.derivative, self.states, inputs, self.vector)
-
-    def _through(self, inputs: FloatArray) -> FloatArray:
-        """Change of the outputs by that of the inputs at the same instant."""
-        size = float(np.abs(inputs).max()) or 1.0
-        eps = _SMALL * (float(np.abs(self.record.inputs).max()) or 1.0) / size
-        return slope_of(lambda part: self._observed(part * inputs, 0.0), eps)
-
-    def _observed(self, inputs: FloatArray | float, vector: FloatArray | float) -> FloatArray:
-        """Outputs of the states with something added to the inputs, and to the parameters."""
-        vectors = (self.vector + vector)[None]
-        return evaluated(self.model.output, self.states, self.record.inputs + inputs, vectors)
-
-    def _finite(self, change: FloatArray) -> FloatArray:
-        scaled = change * self.scale
+    def _change(self, response: FloatArray) -> FloatArray:
+        scaled = response * self.scale
         return scaled if np.all(np.isfinite(scaled)) else np.zeros_like(scaled)
 
 
