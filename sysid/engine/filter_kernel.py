@@ -207,6 +207,9 @@ class FilterKernel(BatchKernel):
                 lines.append(f"{at(self._sums + self.n_measured + j)} += {logarithm}")
         return [*lines, kept, f"{at(self._sums + j)} += e * e", f"record[k, {j}, l] = e"]
 
+    def _estimate(self) -> list[str]:
+        return []  # where they would stand are the sums of logarithms
+
     def _gains(self, j: int) -> dict[int, str]:
         """Row j of the outputs' Jacobian, by places in P; empty text stands for 1."""
         row: dict[int, str] = {}

@@ -89,6 +89,7 @@ class RecordSimulator:
     def __post_init__(self) -> None:
         record, model = self.record, self.kernels.model
         self._start = record.initial_state(model)
+        self._starting = record.starts_at_samples(model)
         self._inputs = with_bends(model, record, splines_of(model))
         missing = ~np.isfinite(record.outputs)
         outputs = np.where(missing, 0.0, record.outputs)
@@ -222,7 +223,7 @@ class RecordSimulator:
         """
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
         padded = lanes.take(_ALL_LANES, mode="wrap")
-        first = [*record.starts_at_samples(model), *[None] * kernel.n_states]
+        first = [*self._starting, *[None] * kernel.n_states]
         (mean, cut), weights = self._taken_in(kernel, trust, corrects)
         variances = noise**2 + scatter
         spread = [0.0 if (j := first[i]) is None else variances[0, j] for i in kernel.reached]
@@ -261,7 +262,7 @@ class RecordSimulator:
         if key not in self._means_of:  # the same in every run of a fit
             self._means_of[key] = self._means(*key)
         means, weights = self._means_of[key], self._weights * trust
-        starting = [j for j in self.record.starts_at_samples(self.kernels.model) if j is not None]
+        starting = [j for j in self._starting if j is not None]
         over = [j for j in self.averaged if j not in means[1]]
         weights[0, starting + over] = 0.0  # of the latter no mean is over yet
         return means, weights

@@ -95,3 +95,27 @@ def test_a_start_elsewhere_is_forgotten_as_outputs_correct_it():
     assert changes[1][first] == pytest.approx(decay, rel=1e-6)
     assert changes[1][later] == pytest.approx(decay**10, rel=1e-6)
     assert abs(changes[0][later]) < 0.5 * abs(changes[1][later])
+
+
+def test_balance_by_the_process_is_the_mean_deviation_that_the_response_tells():
+    """However coarse the integration of a bent equation is."""
+    bent = replace(
+        lag(), name="bent", derivative=lambda x, u, p: ((p[0] * u[0] - x[0] * abs(x[0])) / p[1],)
+    )
+    simulator, record = BatchSimulator(bent, threads=1), noisy_record()
+    vector, scale, start, process = np.array([GAIN, TAU]), np.ones(1), np.zeros(1), np.array([0.5])
+    plain, balanced = (
+        simulator.innovations(
+            vector[None], [record], [scale], np.array([[1]]), [start[None]], NOISE,
+            process=process, balanced=wanted,
+        ).values[..., 0]
+        for wanted in (False, True)
+    )  # fmt: skip
+    response = simulator.filter_response(
+        vector, record, scale, 1, start, NOISE,
+        scatter=np.zeros(plain.shape), trust=np.ones(plain.shape), process=process,
+        colour=np.zeros(1), corrects=True, exact=False, beyond=None,
+    )  # fmt: skip
+    seen = (plain != 0.0) & (response.kept > 0.0)
+    deviation = np.exp(-np.sum(np.log(response.kept[seen])) / np.isfinite(record.outputs).sum())
+    np.testing.assert_allclose(balanced[seen] / plain[seen], deviation, rtol=1e-6)
