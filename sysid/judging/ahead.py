@@ -19,7 +19,8 @@ def compile_ahead(model: ProcessModel, record: Dataset) -> None:
     """Leave in the cache folder what a fit to a record needs behind its search.
 
     A filter for noise of its inputs, plain simulations of outputs that are means over windows, and
-    the intervals by which score tests tell what may be missing. The search's own kernels are left to the search.
+    the intervals by which score tests tell what may be missing. The search's own kernels are left
+    to the search.
 
     >>> from sysid.examples import lag, lag_record
     >>> compile_ahead(lag(), lag_record())

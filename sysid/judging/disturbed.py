@@ -28,7 +28,8 @@ class DisturbedRun:
 
     start: (n_states,), where it begins; response: along it. states: (n_samples, n_states) and
     outputs: (n_samples, n_outputs) of the undisturbed run, these over the record's windows. rates:
-    (n_samples, n_states), its f(x, u, p). workers: that runs share, to be disturbed side by side.
+    (n_samples, n_states), its f(x, u, p). colour: (n_inputs,), part of the inputs' noise that goes
+    on from sample to sample. workers: that runs share, to be disturbed side by side.
     """
 
     model: ProcessModel
@@ -36,6 +37,7 @@ class DisturbedRun:
     record: Dataset
     start: FloatArray
     response: LinearResponse
+    colour: FloatArray
     workers: Workers
 
     @classmethod
@@ -56,17 +58,13 @@ class DisturbedRun:
         whole = with_integrals(model, averaged) if averaged else model
         begin = np.append(start, np.zeros(len(averaged)))
         response = free_response(whole, vector, record.inputs, record.dt, n_steps, begin)
-        return cls(model, vector, record, start, response, workers)
+        white = np.zeros(record.inputs.shape[1])
+        return cls(model, vector, record, start, response, white, workers)
 
     def __post_init__(self) -> None:
         self.states = self.response.states[:, : len(self.model.states)]
         self.outputs = self.over(self.record.windows)
         self.rates = self.rates_of(self.model.derivative, self.vector)
-
-    @property
-    def colour(self) -> FloatArray:
-        """Part of the inputs' noise that goes on from sample to sample, (n_inputs,): none."""
-        return np.zeros(self.record.inputs.shape[1])
 
     @property
     def instants(self) -> FloatArray:

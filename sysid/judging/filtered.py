@@ -26,14 +26,12 @@ class FilteredRun(DisturbedRun):
     """A filter's run of a record under parameters (n_parameters,), and what disturbances change.
 
     As a free run, with changes of the innovations, in the outputs' units, for those of the outputs.
-    scale: (n_outputs,), of the innovations in the response; of_noise: (n_inputs,),
-    the inputs' colour. states: (n_samples, n_states), what the filter foresees at each sample from
-    those before, so that no function of it is of what was measured then; outputs: that over the
-    record's windows.
+    scale: (n_outputs,), of the innovations in the response. states: (n_samples, n_states), what the
+    filter foresees at each sample from those before, so that no function of it is of what was
+    measured then; outputs: that over the record's windows.
     """
 
     scale: FloatArray
-    of_noise: FloatArray
 
     @classmethod
     def of(
@@ -52,15 +50,10 @@ class FilteredRun(DisturbedRun):
             record,
             record.initial_state(model),
             response,
+            objective.colour[place],
             workers,
             scale=objective.scales[place],
-            of_noise=objective.colour[place],
         )
-
-    @property
-    def colour(self) -> FloatArray:
-        """Part of the inputs' noise that goes on from sample to sample, (n_inputs,)."""
-        return self.of_noise
 
     def over(self, windows: FloatArray) -> FloatArray:
         """Outputs of these states over other windows, (n_samples, n_outputs, 2)."""
