@@ -20,7 +20,7 @@ from sysid.experiments import Prior
 _VOLTS = 0.010  # rms at an analog input, where nothing tells more
 _COUNTS = 1.0 / 6.0  # of the count in a sample, by which a speed errs
 _TIMED = 0.1  # of that, beside what the instants of its edges do
-_REPEATED = 3.0  # samples at most that tell of the same edges while the speed changes
+_WAIT = 0.5  # of a sample, to which counts and bounds tell how long the last edge was ago
 _NEVER = 1e3  # s, by which a sample may be off that tells of no time
 
 
@@ -134,11 +134,10 @@ def expected_jitter(omega: FloatArray, dt: float, count: float) -> FloatArray:
     long that the sample tells nothing. omega: (n,) [rad/s]; count: angle of one [rad].
 
     >>> (1e3 * expected_jitter(np.array([0.1, 1.0, 10.0, 1.0]), 1e-3, 1e-3)).round(4).tolist()
-    [0.5, 0.2887, 0.0289, 0.2887]
+    [0.1443, 0.1443, 0.0289, 0.1443]
     """
     length = count / np.maximum(np.abs(omega) * dt, 1e-3 * count)  # samples between edges
-    slack = np.minimum(length, 1.0) / math.sqrt(12.0)
-    jitter = dt * slack * np.sqrt(np.clip(length, 1.0, _REPEATED))
+    jitter = dt * np.minimum(length, _WAIT) / math.sqrt(12.0)
     return np.where(_between_turns(omega * (dt / count)), _NEVER, jitter)
 
 

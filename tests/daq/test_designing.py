@@ -162,14 +162,14 @@ def test_a_shaft_that_turns_round_every_few_samples_tells_edges_no_speed(
 
 
 def test_the_instants_of_edges_err_as_a_log_shows(tmp_path):
-    log = record("prbs.yaml", options={"seed": 1}, out=tmp_path).frame
+    log = record("chirp.yaml", options={"seed": 1}, out=tmp_path).frame
     tick, theta, omega = (log[name].to_numpy() for name in ("tick", "theta", "omega"))
     dt, count = 1.0 / 800.0, 2.0 * np.pi / 8192
     told = mean_speeds(tick, theta, omega, dt, count)
     expected = expected_jitter(omega, dt, count)
-    for low, high in ((1.0, 2.0), (2.0, 5.0), (5.0, 20.0)):
+    for low, high in ((0.6, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 20.0)):
         band = (np.abs(omega) >= low) & (np.abs(omega) < high) & np.isfinite(told.values)
-        assert band.sum() > 100
+        assert band.sum() > 50
         sizes = [np.sqrt(np.mean(each[band] ** 2)) for each in (expected, told.jitter)]
         assert sizes[0] == pytest.approx(sizes[1], rel=0.25)
 
