@@ -1,6 +1,7 @@
 """A rig that is only computed: what its runs would log, and whether they would pass a limit."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from threading import Lock
 
 import numpy as np
@@ -285,10 +286,14 @@ class PlantBench:
     def _accelerates(
         self, inputs: FloatArray, dt: float, signals: Mapping[str, FloatArray]
     ) -> bool:
-        """Whether a shaft's speed changes no faster than the limit holds for possible."""
+        """Whether a shaft's speed changes no faster than the limit holds for possible.
+
+        The speed alone is larger by the margin: it is compared with what currents can make of it.
+        """
         limits = Limits(self._rig, only=Acceleration)
         limits.begin(Phase.RUN, 1.0 / dt)
-        return limits.check(self._samples(inputs, dt, signals, 1.0)) is None
+        samples = self._samples(inputs, dt, signals, 1.0)
+        return limits.check(replace(samples, omega=self._scale * samples.omega)) is None
 
     def _passes(self, samples: Samples) -> bool:
         limits, rate = Limits(self._rig, faults=False), 1.0 / (samples.time[1] - samples.time[0])

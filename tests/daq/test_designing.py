@@ -30,12 +30,13 @@ def asked(tmp_path):
     return write_yaml(tmp_path / "question.yaml", QUESTION)
 
 
-def bench(**changes):
+def bench(margin=0.1, **changes):
     config, device = load_rig("simulated.yaml")
     limits = merged(config.limits.model_dump(), changes)
     config = config.model_copy(update={"limits": type(config.limits).model_validate(limits)})
     model = actuator(parameters="rig")
-    return PlantBench(model, device.plant_model(5.0), config, 5.0), model.nominal[None]
+    plant = device.plant_model(5.0)
+    return PlantBench(model, plant, config, 5.0, margin), model.nominal[None]
 
 
 def commands(motor, brake=0.0):
@@ -101,6 +102,24 @@ def test_a_limit_is_kept_by_the_margin():
         tight, _ = bench(speed=share * float(top))
         records = tight.records(commands(0.9), 1.0 / 800.0, vectors)
         assert (records is not None) == passes, config.name
+
+
+def test_speeds_keep_the_margin_from_what_currents_can_make_of_them():
+    shaken = commands(0.0)
+    shaken[:, 0] = 1.5 * np.sin(2.0 * np.pi * 40.0 * np.arange(400) / 800.0)
+
+    def least(margin):
+        """Acceleration of an ampere that is needed for the run to pass."""
+        low, high = 100.0, 4000.0
+        while high - low > 5.0:
+            middle = 0.5 * (low + high)
+            careful, vectors = bench(margin, encoder={"acceleration": middle})
+            passes = careful.records(shaken, 1.0 / 800.0, vectors) is not None
+            low, high = (low, middle) if passes else (middle, high)
+        return high
+
+    # Some counts a sample are allowed beside it, whatever the margin.
+    assert 1.25 <= least(0.2) / least(0.0) < 1.6
 
 
 @pytest.mark.parametrize(
