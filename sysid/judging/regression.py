@@ -115,40 +115,58 @@ class Regression:
         whole = np.zeros(len(size))
         whole[size > 0.0] = amplitudes / size[size > 0.0]
         return Regressed(
-            self._log_p(self._statistic(left, score), freedom),
+            self._log_p(*self._statistic(left, score, freedom)),
             whole,
             self._coefficients + move,
             move,
             min(float(score @ score) / max(self.squares, 1e-300), 1.0),
         )
 
-    def _log_p(self, statistic: float, freedom: int) -> float:
+    def _log_p(self, statistic: float, freedom: int, draws: float = math.inf) -> float:
         """Logarithm of a statistic's probability by chance, of residuals whose variance is theirs.
 
-        Of a short record that is hardly known: Fisher's distribution, not the chi-square's.
+        Of a short record that is hardly known: Fisher's distribution, not the chi-square's. Nor is
+        what draws, perhaps few, tell: Hotelling's ("The generalization of Student's ratio", Annals
+        of Mathematical Statistics 2, 1931).
         """
         left = max(self._left - freedom, 1)
         chance = float(fdtrc(freedom, left, statistic / freedom * left / self._n))
+        if draws < math.inf:
+            left = max(draws + 1.0 - freedom, 1.0)
+            chance = max(chance, float(fdtrc(freedom, left, statistic / freedom * left / draws)))
         return math.log(chance) if chance > 0.0 else -math.inf
 
-    def _statistic(self, left: FloatArray, score: FloatArray) -> float:
-        """The score's square in units of its covariance, in every direction the larger of three."""
+    def _statistic(
+        self, left: FloatArray, score: FloatArray, freedom: int
+    ) -> tuple[float, int, float]:
+        """The score's square in units of its covariance, in every direction the larger of three.
+
+        With its degrees of freedom, and how many draws tell the covariance.
+        """
         rest = self._residual - left @ score
         terms = (left * rest[:, None])[: self._n]
         terms = terms.reshape(-1, self.whitening.n_outputs, len(score)).sum(axis=1)
-        covariance = _long_run_covariance(terms - terms.mean(axis=0))
-        if self._noises:
-            pushes = self._pushes(left[: self._n])
-            covariance = _larger(covariance, pushes @ pushes.T)
-        return float(score @ np.linalg.solve(_larger(covariance, np.eye(len(score))), score))
+        seen, white = _long_run_covariance(terms - terms.mean(axis=0)), np.eye(len(score))
+        by_residuals = _square(_larger(seen, white), score)
+        if not self._noises:
+            return by_residuals, freedom, math.inf
+        pushes = self._pushes(left[: self._n])
+        by_noise = sum((each @ each.T for each in pushes), np.zeros_like(white))
+        statistic = _square(_larger(_larger(seen, by_noise), white), score)
+        # Variances of independent records add up (Satterthwaite, Biometrics 2, 1946).
+        squares = np.array([np.sum(each**2) for each in pushes])
+        counts = np.array([each.shape[1] for each in pushes])
+        more = 1.0 - statistic / max(by_residuals, 1e-300)
+        spread = float(np.sum(squares**2 / counts)) * more
+        return statistic, freedom, float(squares.sum()) ** 2 / spread if spread > 0.0 else math.inf
 
-    def _pushes(self, left: FloatArray) -> FloatArray:
-        """Changes of the score by draws of the inputs' noise, (k, n_draws of all records)."""
+    def _pushes(self, left: FloatArray) -> list[FloatArray]:
+        """Changes of the score by draws of the inputs' noise, (k, n_draws) of each record."""
         pushes = []
         for rows, noise in self._noises:
             back = self.whitening.back(rows, left)
             pushes.append(back.T @ noise.reshape(len(back), -1))
-        return np.hstack(pushes)
+        return pushes
 
 
 class _Basis:
@@ -234,6 +252,11 @@ def _larger(first: FloatArray, second: FloatArray) -> FloatArray:
     whole = root @ axes
     larger: FloatArray = (whole * np.maximum(ratio, 1.0)) @ whole.T
     return larger
+
+
+def _square(covariance: FloatArray, score: FloatArray) -> float:
+    """Square of a score (k,) in units of its covariance (k, k)."""
+    return float(score @ np.linalg.solve(covariance, score))
 
 
 def _long_run_covariance(terms: FloatArray) -> FloatArray:

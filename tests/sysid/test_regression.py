@@ -1,0 +1,38 @@
+"""Probabilities of score tests by chance, beside how often chance does as much."""
+
+import numpy as np
+import pytest
+
+from sysid.judging.regression import Regression
+from sysid.judging.whitener import Whitener
+from sysid.uncertainty.colour import Autoregression
+
+N, REPETITIONS = 60, 1000
+
+
+def chances(n_draws: int, n_amplitudes: int) -> np.ndarray:
+    """Probabilities of what noise of an input alone has done to residuals, told by some draws."""
+    rng = np.random.default_rng(0)
+    whitening = Whitener(
+        Autoregression(np.zeros((0, 1, 1)), np.eye(1)), (N,), np.ones(N, dtype=bool), np.eye(1)
+    )
+    chances = []
+    for _ in range(REPETITIONS):
+        changes, column = rng.standard_normal((2, N, 1, n_amplitudes))
+        driven = changes[:, 0] @ rng.standard_normal((n_amplitudes, 1 + n_draws))
+        residual = driven[:, :1] + rng.standard_normal((N, 1))
+        draws = [(slice(0, N), driven[:, None, 1:] / np.sqrt(n_draws))]
+        tested = Regression(whitening, column, np.ones(n_amplitudes), residual, draws)
+        result = tested.test(changes, one_sided=False)
+        assert result is not None
+        chances.append(np.exp(result.log_p))
+    return np.array(chances)
+
+
+@pytest.mark.parametrize(("n_draws", "n_amplitudes"), [(12, 3), (200, 1)])
+def test_a_finding_by_chance_is_as_rare_as_its_probability_says_however_few_draws_tell_noise(
+    n_draws, n_amplitudes
+):
+    found = chances(n_draws, n_amplitudes)
+    for level in (0.05, 0.01):
+        assert 0.5 * level < np.mean(found < level) < 1.6 * level
