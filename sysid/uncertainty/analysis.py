@@ -34,6 +34,7 @@ _AWAY = 0.5  # deviations between an estimate and the minimum that slopes forete
 _SAMPLED = 40  # points of a range at which it is tried whether simulations fail
 _DRAWS = 20_000  # of all quantities together
 _ALIKE = 0.05  # rivals closer than this are one
+_NOT_BY_CHANCE = 3.3  # deviations: one in a thousand
 _SIDES = (-1.0, 1.0)
 _ROUNDS = 3  # of searches that go on from what others came to
 _FAR = 0.1  # of the way to an end, by which such a place is beyond it
@@ -527,10 +528,14 @@ class _Analysis:
 
     def _pushed(self) -> BoolArray:
         """Parameters that the data push against an end of their range, (n_free,)."""
+        return self._pushed_by(Z95)
+
+    def _pushed_by(self, deviations: float) -> BoolArray:
+        """The same, by more than so many deviations."""
         outwards = self._outwards(self.free.newton_step)
-        deviations = np.array([self.free.deviation(g) for g in np.eye(len(outwards))])
+        each = np.array([self.free.deviation(g) for g in np.eye(len(outwards))])
         free = ~np.array(self.ties.bound, dtype=bool)
-        pushed: BoolArray = self.on_bound & free & (outwards > Z95 * deviations)
+        pushed: BoolArray = self.on_bound & free & (outwards > deviations * each)
         return pushed
 
     def opened(self, estimates: Sequence[Estimate]) -> Sequence[Estimate]:
@@ -544,9 +549,10 @@ class _Analysis:
     ) -> BoolArray:
         """Parameters, (n_free,), on an end of their range that decides nothing.
 
-        Nor do all such ends together. places: of those for which that is asked, default all.
+        Nor do all such ends together. By chance data may push a friction that is next to nothing
+        below nothing. places: of those for which that is asked, default all.
         """
-        harmless = self.on_bound & ~self.pushed
+        harmless = self.on_bound & ~self._pushed_by(_NOT_BY_CHANCE)
         if places is not None:
             harmless &= np.isin(np.arange(len(harmless)), places)
         for j in np.flatnonzero(harmless).tolist():

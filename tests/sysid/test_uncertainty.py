@@ -735,6 +735,22 @@ def test_an_end_beyond_which_nothing_changes_is_harmless(low, harmless):
     assert (moved < 0.5) is harmless
 
 
+@pytest.mark.parametrize("lacking, harmless", [(0.0, True), (0.05, False)])
+def test_an_end_near_nothing_is_harmless_where_data_push_beyond_it_by_chance(lacking, harmless):
+    """Of noise 2 deviations, in one of forty; of what the model lacks many."""
+
+    def formula(p, u):
+        slip = p["b"] - p["lacking"]
+        return columns((p["a"] + slip) * u[:, 0] + 0.3 * slip * u[:, 1])
+
+    small = unknown("b", 1e-6, lower=1e-9, upper=10.0)
+    lack = unknown("lacking", lacking, "linear", lower=-1.0, upper=1.0)
+    problem = Problem(formula, [unknown("a", 3.0), small, lack], seed=14)
+    told = estimates(problem.tell(ranges={"b": (1e-4, 10.0)}, fixed={"lacking": 0.0}))
+    assert told["b"].on_bound and told["b"].pushed
+    assert told["b"].harmless is harmless
+
+
 def test_ends_that_decide_something_together_are_not_harmless():
     """A tenfold of b or of c is nothing, of both a hundredfold, by which a is another."""
 
