@@ -299,7 +299,7 @@ def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]
         # It is between nothing and what the output's samples show, or known by these.
         shown, is_white = fitted.shown_noise
         most = _CHANCE_OF_SHOWN / np.sqrt(fitted.counts[j]) if is_white[j] else 1.0
-        raises = min(deviation / fall, most * float(shown[j] / fitted.noise[j]) ** 2)
+        raises = min(deviation / fall, most * float(shown[j] / fitted.noise[j]) ** 2 / raised)
         yield (onward - score) * raises * _of_positive(1.0 / (raises * raised))
 
 
