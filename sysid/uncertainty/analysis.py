@@ -550,16 +550,13 @@ class _Analysis:
         """Parameters, (n_free,), on an end of their range that decides nothing.
 
         Nor do all such ends together. By chance data may push a friction that is next to nothing
-        below nothing. places: of those for which that is asked, default all.
+        below nothing. places: of those for which that is candidates, default all.
         """
-        harmless = self.on_bound & ~self._pushed_by(_NOT_BY_CHANCE)
+        candidates = self.on_bound & ~self._pushed_by(_NOT_BY_CHANCE)
         if places is not None:
-            harmless &= np.isin(np.arange(len(harmless)), places)
-        for j in np.flatnonzero(harmless).tolist():
-            harmless[j] = self._range_ends.decide_nothing([j], estimates)
-        together = np.flatnonzero(harmless).tolist()
-        if len(together) > 1 and not self._range_ends.decide_nothing(together, estimates):
-            harmless[:] = False
+            candidates &= np.isin(np.arange(len(candidates)), places)
+        harmless = np.zeros(len(candidates), dtype=bool)
+        harmless[self._range_ends.harmless(np.flatnonzero(candidates).tolist(), estimates)] = True
         return harmless
 
     @cached_property

@@ -6,7 +6,6 @@ low end of its range by chance. That end decides nothing if all would be estimat
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg import null_space
@@ -36,24 +35,26 @@ class RangeEnds:
     changes: Callable[[FloatArray], Mapping[str, float]]
     deviations: Mapping[str, float]
 
-    def decide_nothing(self, places: Sequence[int], estimates: Sequence[Estimate]) -> bool:
-        """Whether beyond the ends of some parameters all else would be estimated alike.
+    def harmless(self, places: Sequence[int], estimates: Sequence[Estimate]) -> list[int]:
+        """Which of some parameters stand on ends beyond which all else would be estimated alike.
 
         Or be where its interval has no end. By the slopes, as where ties would lead inside again;
         or by a run beyond, as where a parameter does next to nothing at that end, and the slope
-        over its logarithm would lead far.
+        over its logarithm would lead far. None where beyond all of these ends something would be
+        another, though it is not beyond each.
         """
-        space, held = self.local.objective.space, self.on_bound.copy()
-        names = {space.names[j] for j in places}
-        combined = [e for e in estimates if e.combination and names & {*e.combination.names}]
-        if any(estimate.why == "end" for estimate in combined):
-            return False
-        held[places] = False
-        others = [estimate for estimate in estimates if estimate.name not in names]
-        if self._alike(self._by_slopes(self._with(held)), others):
-            return True
-        beyond = self._beyond(places)
-        return beyond is not None and self._alike(beyond, others)
+        places = [j for j in places if not self._ends_a_combination(j, estimates)]
+        freed = [j for j in places if self._alike([j], [], estimates)]
+        passed = [j for j in places if j not in freed and self._alike([], [j], estimates)]
+        several = len(freed) + len(passed) > 1
+        if several and not self._alike(freed, passed, estimates):
+            return []
+        return [*freed, *passed]
+
+    def _ends_a_combination(self, j: int, estimates: Sequence[Estimate]) -> bool:
+        name = self.local.objective.space.names[j]
+        combined = [e for e in estimates if e.combination and name in e.combination.names]
+        return any(estimate.why == "end" for estimate in combined)
 
     def opened(self, free: Covariance, estimates: Sequence[Estimate]) -> list[Estimate]:
         """Estimates without the ends of profiles that these ends of ranges have set.
@@ -86,26 +87,27 @@ class RangeEnds:
             ties = null_space(ties[:, held].T).T @ ties
         return covariance(self.local, ties, held)
 
-    @cached_property
-    def _inverse(self) -> FloatArray:
-        """Inverse curvature, (n_free, n_free), of all that stand on no end."""
-        return self._with(self.on_bound).curvature
+    def _moved(self, freed: Sequence[int], passed: Sequence[int]) -> FloatArray | None:
+        """Search coordinates, (n_free,), of the minimum by slopes with some parameters freed.
 
-    def _beyond(self, places: Sequence[int]) -> FloatArray | None:
-        """Search coordinates, (n_free,), of the minimum with parameters beyond their ends.
-
-        Those that stand on no end follow by their slopes. None where a simulation fails beyond.
+        passed: those that are well beyond their ends. None where a simulation fails there.
         """
-        local, objective, there = self.local, self.local.objective, self.local.chromosome.copy()
-        space = objective.space
-        for j in places:
+        local, held = self.local, self.on_bound.copy()
+        held[freed] = False
+        around = self._with(held)
+        at = self._by_slopes(around)
+        if not passed:
+            return at
+        space, there = local.objective.space, local.chromosome.copy()
+        for j in passed:
             there[j] = self._value_beyond(j)
-        residual = local.share * objective.residuals(there[None], local.steps).values[..., 0]
+        residual = local.share * local.objective.residuals(there[None], local.steps).values[..., 0]
         if not np.all(np.isfinite(residual)):
             return None
-        weights = objective.least_squares_weights(local.residual)
+        weights = local.objective.least_squares_weights(local.residual)
         push = np.einsum("tip,i,ti->p", local.slopes, weights, residual - local.residual)
-        minimum: FloatArray = space.encode(there) - self._inverse @ push
+        onward = at - space.encode(local.chromosome) if freed else 0.0
+        minimum: FloatArray = space.encode(there) + onward - around.curvature @ push
         return minimum
 
     def _value_beyond(self, j: int) -> float:
@@ -119,13 +121,22 @@ class RangeEnds:
         parameter = space.parameters[j]
         return min(max(beyond, parameter.minimum), parameter.maximum)
 
-    def _alike(self, point: FloatArray, estimates: Sequence[Estimate]) -> bool:
-        """Whether quantities at a point, (n_free,), are as estimated, or on a side without end."""
-        changes = self.changes(point)
+    def _alike(
+        self, freed: Sequence[int], passed: Sequence[int], estimates: Sequence[Estimate]
+    ) -> bool:
+        """Whether other quantities are as estimated beyond ends, or on a side without end.
+
+        Of several ends it takes more than each may do by itself.
+        """
+        point, names = self._moved(freed, passed), self.local.objective.space.names
+        if point is None:
+            return False
+        moved = {names[j] for j in (*freed, *passed)}
+        changes, unmoved = self.changes(point), _UNMOVED * len(moved)
         return all(
-            abs(changes[estimate.name]) <= _UNMOVED * self.deviations[estimate.name]
+            abs(changes[estimate.name]) <= unmoved * self.deviations[estimate.name]
             or (changes[estimate.name] < 0.0 and estimate.low is None)
             or (changes[estimate.name] > 0.0 and estimate.high is None)
             for estimate in estimates
-            if estimate.name in changes
+            if estimate.name in changes and estimate.name not in moved
         )

@@ -755,7 +755,7 @@ def test_ends_that_decide_something_together_are_not_harmless():
     """A tenfold of b or of c is nothing, of both a hundredfold, by which a is another."""
 
     def formula(p, u):
-        return columns(p["a"] * u[:, 0] + 6e-4 * p["b"] * p["c"] * (u[:, 0] + 0.03 * u[:, 1]))
+        return columns(p["a"] * u[:, 0] + 1.2e-3 * p["b"] * p["c"] * (u[:, 0] + 0.02 * u[:, 1]))
 
     parameters = [unknown(name, value) for name, value in (("a", 3.0), ("b", 10.0), ("c", 10.0))]
     problem, low = Problem(formula, parameters, seed=2), (0.1, 1.0)
@@ -765,7 +765,7 @@ def test_ends_that_decide_something_together_are_not_harmless():
         assert [e.name for e in at_ends] == [*ends] and not any(e.pushed for e in at_ends)
         assert all(e.harmless is (len(ends) == 1) for e in at_ends)
     free = estimates(problem.tell(fixed={"b": 10.0, "c": 10.0}))
-    assert abs(ended["a"].value - free["a"].value) > 0.5 * ended["a"].deviation
+    assert abs(ended["a"].value - free["a"].value) > 1.0 * ended["a"].deviation
 
 
 def test_where_ranges_of_tied_parameters_end_a_profile_there_is_no_end():
