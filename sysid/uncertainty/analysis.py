@@ -550,7 +550,7 @@ class _Analysis:
         """Parameters, (n_free,), on an end of their range that decides nothing.
 
         Nor do all such ends together. By chance data may push a friction that is next to nothing
-        below nothing. places: of those for which that is candidates, default all.
+        below nothing. places: of those for which that is asked, default all.
         """
         candidates = self.on_bound & ~self._pushed_by(_NOT_BY_CHANCE)
         if places is not None:
