@@ -30,7 +30,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import comb
-from typing import Any, Self
+from typing import Any, Self, TypeGuard
 
 import numpy as np
 
@@ -565,6 +565,11 @@ class Innovations(Objective):
             beyond=None if self.shape is None else self.shape.of(self.space.encode(chromosomes)),
             balanced=balanced,
         )
+
+
+def filters(objective: Objective) -> TypeGuard[Innovations]:
+    """Whether an objective is of a filter's innovations, which corrects itself."""
+    return isinstance(objective, Innovations) and objective.corrects
 
 
 def _cut(tables: Sequence[FloatArray], lengths: Sequence[int]) -> list[FloatArray]:

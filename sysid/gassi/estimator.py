@@ -15,7 +15,7 @@ from sysid.engine.compiler import kalman_filter
 from sysid.engine.simulation import BatchSimulator, noisy_inputs
 from sysid.fitting.descent import Point
 from sysid.fitting.free_run import free_run
-from sysid.fitting.innovations import Innovations
+from sysid.fitting.innovations import Innovations, filters
 from sysid.fitting.objective import Balance, Objective
 from sysid.fitting.refinement import begin, refine_each
 from sysid.gassi.cega_objective import CegaObjective
@@ -366,7 +366,7 @@ class GASSI(RecordEstimator):
         explored = self.excerpt_ is not None
         result = fit(objective, minima, begun=begun, explored=explored)
         likeliest = result.optimum
-        if not (isinstance(likeliest.objective, Innovations) and likeliest.objective.corrects):
+        if not filters(likeliest.objective):
             fitted, chromosome = likeliest.objective, likeliest.chromosome
             self.estimated_starts_ = noticed_starts(fitted, chromosome, self.first_samples)
         if self.estimated_starts_:

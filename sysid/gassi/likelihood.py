@@ -22,13 +22,13 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import TOLERANCE, Point
 from sysid.fitting.free_run import accurate, fine_enough, noiseless
-from sysid.fitting.innovations import Innovations
+from sysid.fitting.innovations import Innovations, filters
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, better_by_filter
 from sysid.gassi.lookalikes import lookalikes
-from sysid.gassi.noise_fit import NoiseFit, filters, foresees_more, too_well
+from sysid.gassi.noise_fit import NoiseFit, foresees_more, too_well
 from sysid.gassi.optima import (
     LEAST_SHARE,
     QUICKLY,
@@ -276,6 +276,8 @@ def _refitted(
         starts += more
     if filtered:
         first, starts = better_by_filter(fit, first, starts)
+    explores = filtered and not begun.is_settled
+    if explores:
         first = _centred(first)
     scale = too_well(ranked[0].rms)
     optima, explored = Optima.around(first, fit.given, scale), None
@@ -284,7 +286,6 @@ def _refitted(
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break
         explored = best
-        explores = filtered and not begun.is_settled
         starts += lookalikes(first.objective, best.chromosome) if explores else []
         exact = _exact_among(first, starts) if filtered else None
         if exact is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
@@ -81,11 +81,6 @@ class NoiseFit:
             else:
                 fitted, last = towards(fitted, fitted.settled(chromosome), last)
         return Optimum.of(fitted, chromosome, rms)
-
-
-def filters(objective: Objective) -> TypeGuard[Innovations]:
-    """Whether an objective is of a filter's innovations."""
-    return isinstance(objective, Innovations) and objective.corrects
 
 
 def foresees_more(optimum: Optimum, rival: Optimum) -> bool:

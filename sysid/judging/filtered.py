@@ -18,7 +18,7 @@ from sysid.fitting.innovations import Innovations
 from sysid.judging.disturbed import DisturbedRun, shifted
 from sysid.threads import Workers
 
-_SMALL = 1e-6  # part of an input by which slopes of the rates over it are told
+_SMALL = 1e-6  # part of the parameters by which slopes of the outputs over them are told
 
 
 @dataclass(eq=False, kw_only=True)

@@ -15,7 +15,7 @@ from typing import Literal, Self
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.fitting.innovations import Innovations
+from sysid.fitting.innovations import filters
 from sysid.fitting.objective import Objective
 from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
@@ -262,14 +262,14 @@ def determined_rank(objective: Objective, chromosome: FloatArray) -> int:
 
 def _succession(local: Sensitivity) -> FloatArray:
     criterion = local.criterion
-    if isinstance(criterion, Innovations) and criterion.corrects:
+    if filters(criterion):
         return successive_correlation(local.residual, local.seen, local.lengths)
     return np.zeros(0)
 
 
 def _bent(local: Sensitivity) -> FloatArray:
     criterion = local.criterion
-    if isinstance(criterion, Innovations) and criterion.corrects:
+    if filters(criterion):
         return criterion.bent(local.chromosome)
     return np.zeros(0)
 
@@ -337,7 +337,7 @@ class _Analysis:
         self.named = named_values(self.space, self.chromosome)
         self.on_bound = self.space.on_bound(self.chromosome)
         self.free = covariance(local, structure.directions)
-        self.pushed = self._pushed()
+        self.pushed = self._pushed_by(Z95)
         self.covariance = self.free
         if self.pushed.any():
             self.covariance = covariance(local, structure.directions, self.pushed)
@@ -526,12 +526,8 @@ class _Analysis:
         joint, widest = float(np.mean(largest <= Z95)), float(np.quantile(largest, 0.95))
         return joint, max(widest / Z95, 1.0)
 
-    def _pushed(self) -> BoolArray:
-        """Parameters that the data push against an end of their range, (n_free,)."""
-        return self._pushed_by(Z95)
-
     def _pushed_by(self, deviations: float) -> BoolArray:
-        """The same, by more than so many deviations."""
+        """Parameters, (n_free,), that data push so many deviations beyond an end of a range."""
         outwards = self._outwards(self.free.newton_step)
         each = np.array([self.free.deviation(g) for g in np.eye(len(outwards))])
         free = ~np.array(self.ties.bound, dtype=bool)

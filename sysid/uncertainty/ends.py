@@ -6,6 +6,7 @@ low end of its range by chance. That end decides nothing if all would be estimat
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import null_space
@@ -77,7 +78,7 @@ class RangeEnds:
         """Where the minimum would be, (n_free,), by the slopes."""
         space = self.local.objective.space
         step = np.clip(covariance.newton_step, -_FARTHEST * space.width, _FARTHEST * space.width)
-        minimum: FloatArray = space.encode(self.local.chromosome) + step
+        minimum: FloatArray = self._coded + step
         return minimum
 
     def _with(self, held: BoolArray) -> Covariance:
@@ -92,13 +93,11 @@ class RangeEnds:
 
         passed: those that are well beyond their ends. None where a simulation fails there.
         """
-        local, held = self.local, self.on_bound.copy()
-        held[freed] = False
-        around = self._with(held)
-        at = self._by_slopes(around)
+        around = self._around(freed) if freed else self._around_ends
+        onward = self._by_slopes(around) if freed else self._coded
         if not passed:
-            return at
-        space, there = local.objective.space, local.chromosome.copy()
+            return onward
+        local, there = self.local, self.local.chromosome.copy()
         for j in passed:
             there[j] = self._value_beyond(j)
         residual = local.share * local.objective.residuals(there[None], local.steps).values[..., 0]
@@ -106,15 +105,29 @@ class RangeEnds:
             return None
         weights = local.objective.least_squares_weights(local.residual)
         push = np.einsum("tip,i,ti->p", local.slopes, weights, residual - local.residual)
-        onward = at - space.encode(local.chromosome) if freed else 0.0
-        minimum: FloatArray = space.encode(there) + onward - around.curvature @ push
+        beyond = local.objective.space.encode(there) - self._coded
+        minimum: FloatArray = onward + beyond - around.curvature @ push
         return minimum
+
+    def _around(self, freed: Sequence[int]) -> Covariance:
+        """The covariance with what stands on ends held, but for some parameters."""
+        held = self.on_bound.copy()
+        held[freed] = False
+        return self._with(held)
+
+    @cached_property
+    def _around_ends(self) -> Covariance:
+        return self._around([])
+
+    @cached_property
+    def _coded(self) -> FloatArray:
+        """Search coordinates of the estimate, (n_free,)."""
+        return self.local.objective.space.encode(self.local.chromosome)
 
     def _value_beyond(self, j: int) -> float:
         """A value of parameter j well beyond the end on which it stands."""
         space, value = self.local.objective.space, float(self.local.chromosome[j])
-        coded = float(space.encode(self.local.chromosome)[j])
-        low = coded - space.coded_lower[j] < 0.5 * space.width[j]
+        low = self._coded[j] - space.coded_lower[j] < 0.5 * space.width[j]
         beyond = value / _FACTOR if low else value * _FACTOR
         if not space.log[j]:
             beyond = value + float(-space.width[j] if low else space.width[j])
@@ -126,7 +139,7 @@ class RangeEnds:
     ) -> bool:
         """Whether other quantities are as estimated beyond ends, or on a side without end.
 
-        Of several ends it takes more than each may do by itself.
+        Beyond each of the ends half a deviation may come in.
         """
         point, names = self._moved(freed, passed), self.local.objective.space.names
         if point is None:

@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.averages import just_missed
-from sysid.fitting.innovations import Innovations
+from sysid.fitting.innovations import Innovations, filters
 from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.uncertainty.colour import record_rows
@@ -60,7 +60,7 @@ class Sensitivity:
     @property
     def corrects(self) -> bool:
         """Whether the residuals are innovations of a filter that corrects itself."""
-        return isinstance(self.criterion, Innovations) and self.criterion.corrects
+        return filters(self.criterion)
 
     @cached_property
     def rows(self) -> FloatArray:
@@ -101,7 +101,7 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     whose slopes differ between the sides that side counts that has no jump.
     """
     share: FloatArray | float = 1.0
-    criterion, corrects = objective, isinstance(objective, Innovations) and objective.corrects
+    criterion, corrects = objective, filters(objective)
     perturbation = _FILTER_PERTURBATION if corrects else _PERTURBATION
     distance = perturbation * spans(objective, chromosome)
     at, shift = objective.space.encode(chromosome), np.diag(distance)
@@ -274,7 +274,7 @@ def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]
     the squares.
     """
     fitted, residual = local.criterion, local.residual
-    if not (isinstance(fitted, Innovations) and fitted.corrects):
+    if not filters(fitted):
         return
     score = np.einsum("tip,ti,i->p", local.slopes, residual, weight)
     for j in np.flatnonzero((fitted.weights > 0.0) & (fitted.counts > 1)):

@@ -59,7 +59,7 @@ def test_it_comes_to_what_a_search_comes_to_without_one(case):
     searched, _ = identified(case)
     begun, notes = identified(case, *of(case[2]))
     assert ANEW not in notes
-    assert begun.estimator.n_simulations_ < 0.6 * searched.estimator.n_simulations_
+    assert begun.estimator.n_simulations_ < 0.5 * searched.estimator.n_simulations_
     for name, (low, high) in of(searched)[1].items():
         value = of(searched)[0][name]
         assert of(begun)[0][name] == pytest.approx(value, abs=0.1 * (high - low))
