@@ -103,7 +103,8 @@ def _model(request: bytes) -> ProcessModel:
 @one_thread()
 def _begun(request: bytes, fit: bytes) -> bool:
     with contextlib.suppress(Exception):  # the same
-        return _score_tests(request, fit).functions is not None  # which there may be a need for
+        _ = _score_tests(request, fit).suspicious
+        return True
     return False
 
 

@@ -52,7 +52,7 @@ from sysid.uncertainty.sensitivity import (
 )
 from sysid.uncertainty.ties import free_gradient, named_values
 
-_CHANCE = 1e-3  # probability of a finding by chance, all tests together
+_LOG_CHANCE = np.log(1e-3)  # of the probability of a finding by chance, all tests together
 _SEVERAL = ("variant", "bend", "function", "curve", "disturbance")  # have no single amplitude
 _SLOW = ("delay", "filter", "lag")
 _MOST = 5  # findings
@@ -114,13 +114,24 @@ class ScoreTests:
         in_equations = [*function_suspects(runs), *cycle_suspects(runs), *bend_suspects(runs)]
         return [*in_equations, *curve_suspects(runs), *disturbance_suspects(runs)]
 
+    @cached_property
+    def suspicious(self) -> bool:
+        """Whether anything stands out of which intervals tell nothing but how much it matters."""
+        if self._exact:
+            return False
+        return any(map(self._tests.are_significant, (self._named, self.functions)))
+
     def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
         """What the model lacks, the surest first, and how far it moves what has intervals."""
         if self._exact:
             return ()
         names, tests = self._runs[0].model.parameter_names, self._tests.of(uncertainty)
         alone = [e.name for e in uncertainty.determined() if e.name in names]
-        tests.admit([*self._named, *change_suspects(self._runs, alone)])
+        changing = [*change_suspects(self._runs, alone)]
+        # Among more suspects what is left to chance by itself is so all the more.
+        if not self.suspicious and not tests.are_significant(changing):
+            return ()
+        tests.admit([*self._named, *changing])
         if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
             tests.admit(self.functions)
         return tests.settled()
@@ -175,22 +186,19 @@ class _Tests:
         tests._gradients = np.array(gradients).reshape(-1, self._local.slopes.shape[2])
         return tests
 
+    def are_significant(self, suspects: Sequence[Suspect]) -> bool:
+        """Whether any of the suspects is there by more than chance, before any is admitted."""
+        changes, left, tests = self._asked(suspects)
+        results = self._tested(changes, suspects, left)
+        return any(result.log_p + np.log(tests) < _LOG_CHANCE for result, _ in results.values())
+
     def admit(self, suspects: Sequence[Suspect]) -> None:
         """Admit the suspects that are there by more than chance, each given those before it."""
-        changes = [s.changes / self._scales[..., None] for s in suspects]
-        left = [i for i, change in enumerate(changes) if np.any(change)]
-        # A channel that is late by this or that is one suspect.
-        late = {(suspects[i].kind, suspects[i].name) for i in left if suspects[i].late is not None}
-        tests = len(late) + sum(suspects[i].late is None for i in left)
+        changes, left, tests = self._asked(suspects)
         while left and len(self.findings) < _MOST:
-            first = self._likeliest(changes, suspects, left)
-            again = self._workers.results(
-                lambda task: self._again(*task),
-                [(changes[i], suspects[i], test) for i, test in first.items()],
-            )
-            results = dict(zip(first, again, strict=True))
+            results = self._tested(changes, suspects, left)
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
-            significant = [i for i in logs if logs[i] < np.log(_CHANCE)]
+            significant = [i for i in logs if logs[i] < _LOG_CHANCE]
             if not significant:
                 return
             # Of probabilities too small for a number what explains more decides.
@@ -220,6 +228,25 @@ class _Tests:
             self._ends.append(len(self._free))
             self._regression = self._coloured_by(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
+
+    def _asked(self, suspects: Sequence[Suspect]) -> tuple[list[FloatArray], list[int], int]:
+        """Changes by each suspect, those that change anything, and how many tests these are."""
+        changes = [s.changes / self._scales[..., None] for s in suspects]
+        left = [i for i, change in enumerate(changes) if np.any(change)]
+        # A channel that is late by this or that is one suspect.
+        late = {(suspects[i].kind, suspects[i].name) for i in left if suspects[i].late is not None}
+        return changes, left, len(late) + sum(suspects[i].late is None for i in left)
+
+    def _tested(
+        self, changes: Sequence[FloatArray], suspects: Sequence[Suspect], left: Sequence[int]
+    ) -> dict[int, tuple[Regressed, FloatArray]]:
+        """Tests of the likeliest suspects, and what each leaves."""
+        first = self._likeliest(changes, suspects, left)
+        again = self._workers.results(
+            lambda task: self._again(*task),
+            [(changes[i], suspects[i], test) for i, test in first.items()],
+        )
+        return dict(zip(first, again, strict=True))
 
     def _likeliest(
         self, changes: Sequence[FloatArray], suspects: Sequence[Suspect], left: Sequence[int]
