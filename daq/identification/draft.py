@@ -103,7 +103,7 @@ def _model(request: bytes) -> ProcessModel:
 @one_thread()
 def _begun(request: bytes, fit: bytes) -> bool:
     with contextlib.suppress(Exception):  # the same
-        _ = _score_tests(request, fit).suspicious
+        _ = _score_tests(request, fit).suspicious  # all that is asked without intervals
         return True
     return False
 

@@ -106,20 +106,11 @@ class ScoreTests:
         self._named = [*channels, *variant_suspects(runs)]
 
     @cached_property
-    def functions(self) -> list[Suspect]:
-        """Functions in the equations, for which there may be no need."""
-        if self._exact:
-            return []
-        runs = self._runs
-        in_equations = [*function_suspects(runs), *cycle_suspects(runs), *bend_suspects(runs)]
-        return [*in_equations, *curve_suspects(runs), *disturbance_suspects(runs)]
-
-    @cached_property
     def suspicious(self) -> bool:
-        """Whether anything stands out of which intervals tell nothing but how much it matters."""
+        """Whether anything stands out that can be tested without intervals."""
         if self._exact:
             return False
-        return any(map(self._tests.are_significant, (self._named, self.functions)))
+        return any(map(self._tests.are_significant, (self._named, self._functions)))
 
     def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
         """What the model lacks, the surest first, and how far it moves what has intervals."""
@@ -133,8 +124,15 @@ class ScoreTests:
             return ()
         tests.admit([*self._named, *changing])
         if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
-            tests.admit(self.functions)
+            tests.admit(self._functions)
         return tests.settled()
+
+    @cached_property
+    def _functions(self) -> list[Suspect]:
+        """Functions in the equations, for which there may be no need."""
+        runs = self._runs
+        in_equations = [*function_suspects(runs), *cycle_suspects(runs), *bend_suspects(runs)]
+        return [*in_equations, *curve_suspects(runs), *disturbance_suspects(runs)]
 
 
 class _Tests:
