@@ -49,7 +49,10 @@ class Trigger:
         self, ready: float, history: History, columns: tuple[str, ...], width: float
     ) -> bool:
         place = columns.index(self.channel)
-        rows = history.rows(max(history.span[0], self._after - width), ready, _MOST)
+        begin = max(history.span[0], self._after - width)
+        if ready <= begin:
+            return False  # as after the last passage of a run that has ended
+        rows = history.rows(begin, ready, _MOST)
         times, values = rows[:, columns.index("t")], rows[:, place]
         noise = _HYSTERESIS * float(history.spread[place])
         passed = times[passages(values, self.level, self.rising, noise)]

@@ -267,7 +267,12 @@ def test_a_trigger_stands_at_the_newest_passage_that_is_shown_whole():
     wave = np.sin(2.0 * np.pi * time)
     noise = 0.01 * np.random.default_rng(3).normal(size=len(time))
     rows = np.column_stack([time, wave + noise])
-    history, columns = History(("t", "torque"), lambda start, end: rows[start:end]), ("t", "torque")
+
+    def read(start, end):
+        assert start <= end, "a file is read forwards"
+        return rows[start:end]
+
+    history, columns = History(("t", "torque"), read), ("t", "torque")
     found = {"rises": [], "falls": []}
     triggers = {name: Trigger("torque", 0.5, name == "rises") for name in found}
     for first in range(0, len(rows), 40):
@@ -278,9 +283,10 @@ def test_a_trigger_stands_at_the_newest_passage_that_is_shown_whole():
     assert np.allclose(found["rises"], np.arange(5) + 1.0 / 12.0, atol=0.02)
     assert np.allclose(found["falls"], np.arange(5) + 5.0 / 12.0, atol=0.02)
     late = Trigger("torque", 0.5, rising=True)
-    assert not late.look(history, columns, 50.0)
-    assert late.look(history, columns, 50.0, ended=True)
+    assert not late.look(history, columns, 6.5)
+    assert late.look(history, columns, 6.5, ended=True)
     assert late.at == pytest.approx(4.0 + 1.0 / 12.0, abs=0.02)
+    assert not late.look(history, columns, 6.5, ended=True), "it stands there"
     lost = Trigger("speed", 0.5, rising=True)
     assert not lost.look(history, columns, 0.5) and lost.text().endswith("0.5: not yet")
 
