@@ -13,7 +13,15 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
-from daq.errors import ConfigError, DeviceError, RigError, RunError, Terminated, raised_in
+from daq.errors import (
+    ConfigError,
+    DeviceError,
+    RigError,
+    RunError,
+    Terminated,
+    UnreachedError,
+    raised_in,
+)
 from daq.hal import ANALOG_INPUTS, CHANNELS, DeviceInfo, IntArray, RawSamples
 
 _Arguments = ParamSpec("_Arguments")
@@ -65,7 +73,8 @@ def call(
 
 def _in_words(method: Callable[..., Any], error: BaseException) -> RigError:
     if isinstance(error, RigError) and str(error).strip():
-        kind = next((kind for kind in (ConfigError, RunError) if type(error) is kind), DeviceError)
+        kinds = ConfigError, RunError, UnreachedError
+        kind = next((kind for kind in kinds if type(error) is kind), DeviceError)
         return kind.of(
             replace(mistake, problem=printable(mistake.problem), cure=printable(mistake.cure))
             for mistake in error.mistakes

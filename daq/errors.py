@@ -129,6 +129,10 @@ class DeviceError(RigError):
     """The device failed or cannot do what was asked."""
 
 
+class UnreachedError(DeviceError):
+    """Nobody was reached: nothing was asked of any device, so that a run has not begun."""
+
+
 class RunError(RigError):
     """A run ended before its time; the log holds what was measured until then."""
 

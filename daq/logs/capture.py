@@ -67,7 +67,7 @@ class Capture:
             write_metadata(folder, metadata or Metadata())
             capture._reserve()
         except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)  # nothing has been recorded in it
+            capture.discard()
             raise
         return capture
 
@@ -88,6 +88,10 @@ class Capture:
         except OSError as error:
             cure = "free space on the disk, or choose another with --out"
             raise RunError(f"cannot be written: {error.strerror}", cure=cure, file=path) from None
+
+    def discard(self) -> None:
+        """Remove the folder, in which nothing has been recorded."""
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def finish(self, status: str, reason: str | None, **facts: Any) -> None:
         """Note how the run ended, and the fingerprint of its log.

@@ -12,6 +12,7 @@ from daq.errors import (
     RigError,
     RunError,
     Terminated,
+    UnreachedError,
 )
 from daq.experiment import Aboard, ClosedLoop, Experiment, Plan
 from daq.hal import ANALOG_INPUTS, Device, Phase
@@ -241,6 +242,9 @@ class _Run:
         if disturbance is not None and disturbance not in reason:
             reason += f"; {self.capture.log_path.name}: {disturbance}"
             error.add_note(f"{self.capture.log_path}: {disturbance}")
+        if isinstance(error, UnreachedError) and self.sampling.phase is Phase.OPEN:
+            self.capture.discard()
+            return
         self._finish(status, reason)
         n = log.n_samples if log is not None else 0
         late = self.sampling.timing.flags.get("held", 0)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from daq.errors import ConfigError, DeviceError, Mistake
+from daq.errors import ConfigError, DeviceError, Mistake, UnreachedError
 from daq.serial.messages import WATCHDOG_ZEROES
 
 _PATIENCE = 0.01  # s that a read waits at most
@@ -189,7 +189,7 @@ class SocketLink:
         try:
             self._socket = socket.create_connection((host.strip("[]"), int(number)), timeout=2.0)
         except OSError as error:
-            raise DeviceError(
+            raise UnreachedError(
                 f"nobody answers there ({error}); check address and port number, and that the "
                 "emulator or device server is running",
                 file=port,
@@ -249,7 +249,7 @@ def latency_timer(port: str) -> tuple[Path, int] | None:
         return None
 
 
-def _not_opened(port: str, error: Exception) -> DeviceError:
+def _not_opened(port: str, error: Exception) -> UnreachedError:
     number = getattr(error, "errno", None)
     text = str(error)
     problem, cure = f"it cannot be opened ({text})", "'rig ports' lists those that there are"
@@ -263,7 +263,7 @@ def _not_opened(port: str, error: Exception) -> DeviceError:
         problem, cure = f"another program has it open{_holder(port)}", "close that first"
     elif number in {errno.ENOTTY, errno.EISDIR} or f"({errno.ENOTTY}," in text:
         problem = "that is no serial port"
-    return DeviceError(problem, cure=cure, file=port)
+    return UnreachedError(problem, cure=cure, file=port)
 
 
 def permission_cure(port: str) -> str:
@@ -282,7 +282,10 @@ def _holder(port: str) -> str:
     device = Path(port).resolve()
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            words = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+            words = " ".join(
+                word if word.startswith("-") else Path(word).name  # folders say little, and much
+                for word in (process / "cmdline").read_bytes().decode().split("\0")
+            ).strip()
             # The other end of a pty holds it as well.
             if " emulate" in words or int(process.name) == os.getpid():
                 continue

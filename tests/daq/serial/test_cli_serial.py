@@ -125,6 +125,7 @@ def test_a_port_on_the_command_line_goes_before_the_files(tmp_path, run, running
     assert (
         json.loads(absent.stdout)["errors"][0]["cure"] == "'rig ports' lists those that there are"
     )
+    assert not list((tmp_path / "runs").iterdir()), "where nobody was reached there was no run"
     assert run([*words, "--port", running.port], tmp_path).returncode == 0
     result = run(["check", "e.yaml", "--rig", "serial.yaml", "--port", "COM3"], tmp_path)
     assert result.returncode == 0 and "--port COM3" in result.stdout, "a check opens nothing"
