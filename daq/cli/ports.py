@@ -40,7 +40,7 @@ def ports(
 
 def _show(inquiries: list[Inquiry], unasked: bool) -> None:
     if not inquiries:
-        print(
+        terminal.print_text(
             "No serial port has hardware behind it. Plug the device in, or start 'rig emulate' "
             "and name the port that it prints:  rig ports PORT"
         )

@@ -34,6 +34,9 @@ _documents: ContextVar[TextIO | None] = ContextVar("documents", default=None)
 _has_document: ContextVar[bool] = ContextVar("has_document", default=False)
 _VOLUMES = {"warning": Volume.QUIET, "note": Volume.NORMAL, "detail": Volume.VERBOSE}
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
+_SPACE = r" +"
+_JOINTS = "-_,:/"  # behind which a name may be wrapped, heads behind the first two
+_JOINT, _JOINT_OF_HEADS = rf"(?<=[{_JOINTS}])| +", r"(?<=[-_])| +"
 _BESIDE_BAR = 70  # columns of a progress line beside its bar: name, status, time
 
 
@@ -105,7 +108,9 @@ def print_next(*commands: str, purpose: str = "") -> None:
         if purpose:
             print_text(purpose)
         for index, command in enumerate(commands):
-            print(f"{'Then' if index else 'Next'}: {command}")
+            # A command is copied from one line, however the terminal shows it; a sentence is read.
+            show = print if command.startswith("rig ") else print_text
+            show(f"{'Then' if index else 'Next'}: {command}")
 
 
 def print_steps(steps: Sequence[tuple[str, str]]) -> None:
@@ -175,7 +180,7 @@ def print_table(
     """A table: with rules on a terminal, in a pipe a line for each row however long.
 
     The first column and those named in ``text`` are text, the others numbers. On a narrow terminal
-    heads and text are wrapped between words; nothing is cut.
+    heads and text are wrapped between words, long names behind a hyphen and such; nothing is cut.
     """
     words = [index == 0 or name in text for index, name in enumerate(head)]
     if not sys.stdout.isatty():
@@ -198,11 +203,11 @@ def print_table(
     )  # fmt: skip
     for name, width, is_text in zip(head, widths, words, strict=True):
         table.add_column(
-            _folded(name, width), width=width, justify="left" if is_text else "right",
-            overflow="fold",
+            _folded(name, width, _JOINT_OF_HEADS), width=width, overflow="fold",
+            justify="left" if is_text else "right",
         )  # fmt: skip
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(_cell, row, widths))
     # Where even the longest words have no room, the terminal breaks the lines.
     console.width = max(console.width, sum(widths) + 3 * len(head))
     # Above the table rather than in it, where a long title would wrap to the table's width.
@@ -246,11 +251,18 @@ def _lines(cells: Iterable[str]) -> list[str]:
 
 
 def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int) -> list[int]:
-    """Widths of columns, heads first, within the room: numbers and words stay whole."""
-    widths = []
-    for cells, is_text in zip(columns, words, strict=True):
-        parts = " ".join(cells[1:]).split() if is_text else list(cells[1:])
-        widths.append(max(map(len, [*parts, *_parts(cells[0])]), default=0))
+    """Widths of columns, heads first, within the room: numbers and words stay whole if they can.
+
+    Else names are wrapped at their joints, and if that is not enough cells of numbers between them.
+    """
+    for text, numbers in ((_SPACE, None), (_JOINT, None), (_JOINT, _SPACE)):
+        widths = []
+        for cells, is_text in zip(columns, words, strict=True):
+            joint = text if is_text else numbers
+            parts = [part for cell in cells[1:] for part in _parts(cell, joint)]
+            widths.append(max(map(len, [*parts, *_parts(cells[0], _JOINT_OF_HEADS)]), default=0))
+        if sum(widths) <= room:
+            break
     # What is left goes to text first, which is wrapped in every row.
     for index in sorted(range(len(columns)), key=lambda i: not words[i]):
         spare = max(room - sum(widths), 0)
@@ -258,23 +270,28 @@ def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int
     return widths
 
 
-def _parts(head: str) -> list[str]:
-    """Where a head may be wrapped: between words, and of a name behind an underscore or hyphen."""
-    return [part for part in re.split(r"(?<=[_-])| +", head) if part]
+def _parts(text: str, joint: str | None) -> list[str]:
+    """Pieces of a text, which may be wrapped at this pattern; the whole of it without one."""
+    return [text] if joint is None else [part for part in re.split(joint, text) if part]
 
 
-def _folded(head: str, width: int) -> str:
-    """A head on lines no wider than that, as far as its parts allow."""
-    if len(head) <= width:
-        return head
+def _folded(text: str, width: int, joint: str) -> str:
+    """A text on lines no wider than that, as far as its parts allow."""
+    if len(text) <= width:
+        return text
     lines = [""]
-    for part in _parts(head):
-        between = "" if lines[-1].endswith(("_", "-")) or not lines[-1] else " "
+    for part in _parts(text, joint):
+        between = " " if lines[-1] and lines[-1][-1] not in _JOINTS else ""
         if len(lines[-1] + between + part) <= width or not lines[-1]:
             lines[-1] += between + part
         else:
             lines.append(part)
     return "\n".join(lines)
+
+
+def _cell(text: str, width: int) -> str:
+    """A cell whose long names are wrapped at their joints; its words the table wraps."""
+    return re.sub(r"\S+", lambda word: _folded(word[0], width, _JOINT), text)
 
 
 @contextmanager

@@ -115,6 +115,8 @@ print_table("Title [rad/s]", ["name", "omega [rad/s]", "meaning"],
             [["K_m", "0.135 .. 0.151", "[low, high] of a :smile:" * 9]], text=["meaning"])
 print_table("Wide", ["output", "RMSE, training", "with applied_voltage_motor", "fit [%]"],
             [["current_motor", "0.00969", "100 %", "98.7"]])
+print_table("Named", ["output", "log", "RMSE", "in its unit"],
+            [["omega", "20260101T120000Z-prbs-validation", "0.0256", "0.377 rad/s"]], text=["log"])
 print_text("  " + "Trust: good. " * 9)
 """
 
@@ -148,12 +150,13 @@ def test_a_narrow_terminal_cuts_nothing(columns):
     assert "…" not in shown
     assert "0.135 .. 0.151" in shown and "omega [rad/s]" in shown
     assert shown.count(":smile:") >= 9
-    # Heads are folded, where they have parts, and names of rows are not.
-    assert re.search("current_motor +0.00969 ", shown)
+    # Heads are folded, where they have parts, and names only where that does not make room enough.
+    assert re.search("current_motor +0.00969 " if columns == 50 else "current_ +0.00969 ", shown)
     assert "with applied_voltage_motor" not in shown and "voltage_" in shown
     sentences = [line for line in shown.splitlines() if "good." in line]
     assert len(sentences) > 2 and all(line.startswith("  ") for line in sentences)
     assert max(map(len, sentences)) <= columns
+    assert re.search("20260101T120000Z- +0.0256 ", shown), "wrapped where a name has a joint"
     wide = shown[shown.index("Wide") :].splitlines()
     assert columns == 30 or max(map(len, wide)) <= columns
 
