@@ -374,6 +374,11 @@ def _show_comparison(result: ComparisonResult) -> None:
         f"AIC and BIC count {comparison.n_samples} training samples as "
         f"{comparison.n_independent:.0f} independent ones."
     )
+    if result.n_left_out:
+        terminal.print_text(
+            f"All errors here are without the first {result.n_left_out} samples of each log, which "
+            "the linear models are given."
+        )
     terminal.print_text(comparison.verdict)
     for line in _runs_lines(result.campaign):
         terminal.print_text(line)
@@ -384,17 +389,15 @@ def _show_comparison(result: ComparisonResult) -> None:
 
 def _print_in_units(result: ComparisonResult, comparison: Comparison) -> None:
     """RMSE of every structure and output, in validation and in training."""
-    outputs, number = result.group.problem.model.outputs, terminal.number
-    head, validated = ["structure"], comparison.validated
-    if validated:
-        head += [f"{output.name}, validation [{output.unit}]" for output in outputs]
-    head += [f"{output.name}, training [{output.unit}]" for output in outputs]
+    outputs = result.group.problem.model.outputs
     rows = []
     for row in comparison.rows:
-        tested = row.rmse_absolute.tolist() if validated else []
-        values = [*tested, *row.training_rmse_absolute.tolist()]
-        rows.append([row.name, *(number(value, 3) for value in values)])
-    terminal.print_table("RMSE of the free run in the outputs' units", head, rows)
+        tested = [("validation", row.rmse_absolute)] if comparison.validated else []
+        for data, values in (*tested, ("training", row.training_rmse_absolute)):
+            cells = [terminal.number(value, 3) for value in values.tolist()]
+            rows.append(["" if tested and data == "training" else row.name, data, *cells])
+    head = ["structure", "data", *(f"{output.name} [{output.unit}]" for output in outputs)]
+    terminal.print_table("RMSE of the free run in the outputs' units", head, rows, text=["data"])
 
 
 def _runs_lines(campaign: Campaign) -> list[str]:

@@ -121,6 +121,11 @@ class ComparisonResult(Shown):
         return self.group.problem.model.output_names
 
     @property
+    def n_left_out(self) -> int:
+        """Samples at the beginning of each log that no error counts: linear models start there."""
+        return max(candidate.n_lags for candidate in self.candidates)
+
+    @property
     def file(self) -> Path:
         """Where the document was written."""
         return self.folder / "comparison.yaml"
@@ -144,6 +149,7 @@ class ComparisonResult(Shown):
             "training": [str(log.path) for log in group.training],
             "validation": [str(log.path) for log in group.validation],
             "structures": structures,
+            "samples_left_out": self.n_left_out,
             "criteria": {
                 "formula": _FORMULA,
                 "samples": comparison.n_samples,

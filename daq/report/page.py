@@ -21,6 +21,7 @@ TOPICS = (
     "data", "parameters", "responses", "residuals", "frequency", "torque", "excitation", "search",
 )  # fmt: skip
 _CODE = re.compile("`([^`]+)`")  # what is typed, in sentences
+_JOINT = re.compile(r"(?<=[-_,:/])(?=\w)")  # where a long name may be broken
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -73,6 +74,7 @@ def rendered(
         "plain": lambda value: Markup(notation.number_html(notation.shortest(value))),
         "of": _of,
         "sized": _sized,
+        "jointed": lambda name: Markup(_JOINT.sub("<wbr>", str(escape(name)))),
         "percent": lambda value: _marked(value, notation.percent),
         "marked": lambda text: Markup(_CODE.sub(r"<code>\1</code>", str(escape(text)))),
     }

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.signal import welch
 
 from daq.errors import ConfigError
 from daq.figures import style
@@ -275,6 +276,23 @@ def _correlations(names: Sequence[str], rows: Rows) -> FloatArray:
     return matrix
 
 
+def _input_density(records: Sequence[Dataset], frequency: FloatArray) -> tuple[int, FloatArray]:
+    """Segments, and power spectral density of each input at these frequencies [Hz], (n, n_inputs).
+
+    Of all samples, also where an output is not measured: a rare input may change just there.
+    """
+    n_segments, total = 0, np.zeros((len(frequency), records[0].inputs.shape[1]))
+    for record in records:
+        rate = 1.0 / record.dt
+        length = round(rate / frequency[0])
+        n = max((record.n_samples - length) // (length // 2) + 1, 0)
+        if n:
+            varying = record.inputs - record.inputs.mean(axis=0)
+            density = welch(varying, rate, nperseg=length, detrend=False, axis=0)[1]
+            n_segments, total = n_segments + n, total + n * density[1:-1]
+    return n_segments, total / n_segments
+
+
 def _frequency(subject: Subject) -> Iterator[Picture]:
     try:
         measured = frequency_response(subject.records)
@@ -289,11 +307,12 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         f" No frequency response of {', '.join(unexplained)} is drawn: an input explains it (with "
         f"a coherence above {_COHERENT}) at fewer than {_FEWEST_COHERENT} of these frequencies."
     ) * bool(unexplained)
-    densities = {inputs[i].name: measured.input_density[:, i] for i in varied}
+    n_segments, density = _input_density(subject.records, measured.frequency)
+    densities = {inputs[i].name: density[:, i] for i in varied}
     yield Picture(
         "spectra", "excitation",
         "Spectra of the excitation: power spectral density of the inputs, Welch's estimate from "
-        f"{measured.n_segments} segments.{missing}",
+        f"{n_segments} segments.{missing}",
         spectra(measured.frequency, densities, {signal.name: signal.unit for signal in inputs}),
     )  # fmt: skip
     identified = _estimated_response(subject)

@@ -136,7 +136,11 @@ def test_tables_for_people_and_a_page_that_says_how_to_do_it_again(folder):
     )
     assert "Validation, free run: RMSE in parts of max|y| (fit in %)" in text
     assert "RMSE of the free run in the outputs' units" in text
-    assert "y, validation [m]" in text and "y, training [m]" in text
+    assert re.search(r"structure +data +y \[m\]", text)
+    assert re.findall(r" (validation|training) +\d", text) == ["validation", "training"] * 3
+    left_out = kept["samples_left_out"]
+    assert left_out > 0 and f"without the first {left_out} samples of each log" in text
+    assert f"without the first {left_out} samples of each log" in " ".join(page.text.split())
     assert "dAIC" in text and "dBIC" in text and "worse, by more than chance" in text
     assert "ARX:na=" in text and "comparison.yaml" in text
 

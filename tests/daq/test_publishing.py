@@ -304,6 +304,21 @@ def test_without_intervals_and_validation_the_page_says_so(work, rig):
 
 
 @pytest.mark.soak
+def test_spectra_of_inputs_are_of_all_samples_also_where_an_output_was_not_measured(work, rig):
+    lines = (work / "check.csv").read_text().splitlines()
+    lost = [line.rpartition(",")[0] + "," if n == 300 else line for n, line in enumerate(lines)]
+    (work / "lost.csv").write_text("\n".join(lost) + "\n")
+    counts = []
+    for name in ("check", "lost"):
+        args = ["identify", f"{name}.csv", "--config", "id.yaml", "--out", name]
+        done = rig(args, cwd=work, report=True)
+        assert done.returncode == 0, done.stderr
+        page = Page((work / name / "report.html").read_text(encoding="utf-8"))
+        counts += re.findall(r"Welch.s estimate from (\d+) segments", page.text)
+    assert len(counts) == 2 and counts[0] == counts[1]
+
+
+@pytest.mark.soak
 def test_figures_are_drawn_again_in_other_formats(result, work, rig):
     formats = ["--format", "png", "--format", "svg"]
     done = rig(["figures", "found", "--trust", *formats, "--out", "drawn", "--json"], cwd=work)
