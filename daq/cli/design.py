@@ -91,7 +91,7 @@ def _show(result: DesignResult) -> None:
         terminal.print_text(
             f"Stays unknown: {names}: {unknown.why}. What would tell: {unknown.cure}."
         )
-    _show_next(result.runs, result.figure)
+    _show_next(result)
 
 
 def _show_pairs(result: DiscriminationResult) -> None:
@@ -120,7 +120,7 @@ def _show_pairs(result: DiscriminationResult) -> None:
                 f"{contest.rival} does all that {contest.truth} does: where both fit alike, take "
                 f"{contest.truth}."
             )
-    _show_next(result.runs, result.figure)
+    _show_next(result)
 
 
 def _pairs(result: DiscriminationResult) -> set[tuple[str, str]]:
@@ -144,9 +144,12 @@ def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:
     terminal.print_table(title, head, rows, text=["protocol"])
 
 
-def _show_next(runs: Sequence[PlannedRun], figure: Path) -> None:
-    print(f"Experiments, {figure.name} and design.json: {figure.parent}")
-    first = shlex.quote(str(runs[0].file))
+def _show_next(result: DesignResult | DiscriminationResult) -> None:
+    from daq.lookup.rigs import DEFAULT_RIG
+
+    print(f"Experiments, {result.figure.name} and design.json: {result.figure.parent}")
+    rig = None if result.rig_name == DEFAULT_RIG else result.rig_name
+    first = shlex.quote(str(result.runs[0].file)) + options.rig_words(rig, None)
     terminal.print_next(f"rig check {first}", f"rig run {first}, and so each of them")
 
 

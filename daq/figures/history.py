@@ -56,13 +56,15 @@ def history(overlays: Sequence[Overlay], trends: Sequence[Trend]) -> Figure:
         _draw_overlay(axis, overlay)
     for axis, trend in zip(panels[1], trends, strict=True):
         _draw_trend(axis, trend)
-    for group, label in zip(panels, ("time [s]", "date of the run (UTC)"), strict=True):
+    for group in panels:
         for axis in group[1:]:
             axis.sharex(group[0])
         for axis in group[:-1]:
             axis.tick_params(labelbottom=False)
-        if group:
-            group[-1].set_xlabel(label)
+    if panels[0]:
+        panels[0][-1].set_xlabel("time [s]")
+    if panels[1]:  # what the dates have in common stands at the axis's right end
+        panels[1][-1].set_xlabel("date of the run (UTC)", loc="left")
     style.legend(figure, axes[0])
     return figure
 
@@ -110,7 +112,8 @@ def _draw_trend(axis: Axes, trend: Trend) -> None:
     name = f"{notation.label(trend.name)} {notation.bracketed(trend.unit)}"
     axis.text(0.0, 1.04, name, transform=axis.transAxes, va="bottom")
     axis.yaxis.set_major_formatter(lambda value, _: notation.number(value, _DIGITS))
-    locator = AutoDateLocator(maxticks=_DATES)  # type: ignore[no-untyped-call]
+    # With at least two marks there is a step for every span.
+    locator = AutoDateLocator(minticks=2, maxticks=_DATES)  # type: ignore[no-untyped-call]
     axis.xaxis.set_major_locator(locator)
     formatter = ConciseDateFormatter(locator, tz=datetime.UTC)  # type: ignore[no-untyped-call]
     axis.xaxis.set_major_formatter(formatter)

@@ -165,6 +165,19 @@ def test_runs_stand_beside_each_other_in_a_table_and_in_a_figure(lab, tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("minutes", [4, 175])
+def test_the_axis_of_dates_has_marks_for_runs_however_far_apart(lab, tmp_path, minutes):
+    for capture in captures(lab):
+        shutil.copytree(lab / capture, tmp_path / capture)
+    record = tmp_path / captures(lab)[0] / "run.json"
+    content = json.loads(record.read_text())
+    earlier = datetime.datetime.fromisoformat(content["started"])
+    content["started"] = (earlier - datetime.timedelta(minutes=minutes)).isoformat()
+    record.write_text(json.dumps(content))
+    result = rig("runs", "--plot", "all.png", "--parameters", "gain", cwd=tmp_path)
+    assert result.returncode == 0 and "warning" not in result.stderr, result.stderr
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
 def test_eighty_columns_hold_what_is_listed_compared_and_refused(lab):
     def at_80_columns(*words):

@@ -140,6 +140,9 @@ def test_what_the_protocol_concludes_is_written_and_shown(run, tmp_path):
     again = rig("analyse", folder, "--trust", "--json", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert json.loads(again.stdout) == document["findings"]
+    printed = rig("analyse", folder, "--trust", cwd=tmp_path).stdout
+    rig_file = record_of(tmp_path / folder)["rig_file"]
+    assert f"Next: rig run prbs.yaml --rig {rig_file} --identify --config " in printed
 
 
 def test_a_run_from_which_nothing_follows_says_why(run, tmp_path):
