@@ -58,6 +58,9 @@ def check(
         print(f"Figure: {plot}")
     if lacks_port(checked.session.rig):
         port = "PORT"  # to be filled in, as rig ports has it
+        terminal.print_text(
+            "No port is named in the rig's file, nor by --port: rig ports lists them."
+        )
     identify = " --identify" if checked.session.validation and not checked.concludes else ""
     on_rig = options.rig_words(rig, port)
     terminal.print_next(f"rig run {shlex.quote(experiment)}{on_rig}{identify}")

@@ -118,7 +118,10 @@ def problems_of(
     plain = [model for model, _ in declared]
     doubts: Sequence[Mistake] = ()
     if check.mistakes(file, IdentificationConfig, file.content):
-        doubts = [*unconverted, *_unknown_names(file, plain, before_additions=True)]
+        fixed = file.content.get("fixed")
+        values = fixed if isinstance(fixed, Mapping) else {}
+        beyond = [m for model in plain for m in _beyond_limits(file, values, model)]
+        doubts = [*unconverted, *_unknown_names(file, plain, before_additions=True), *beyond]
     settings = check.validate(file, IdentificationConfig, others=doubts)
     selection = Selection.under(settings, file)
     for model, name in declared:
@@ -463,12 +466,7 @@ def _check_space(
         within = {"ranges": {name: ranges[name]}} if name in ranges else {}
         if name not in fixed and name not in tied:
             singles.append(("scale", name, {"scale": {name: scale[name]}, **within}))
-    mistakes: list[Mistake] = []
-    for name in fixed:
-        try:
-            model.with_parameters(**{name: {"nominal": fixed[name], "fixed": True}})
-        except ModelError as error:
-            mistakes += file.error(("fixed", name), str(error)).mistakes
+    mistakes = _beyond_limits(file, fixed, model)
     for group, name, part in singles:
         try:
             SearchSpace.of(model, **part)
@@ -483,6 +481,19 @@ def _check_space(
         if name not in space.names:
             problem = f"{name} is not searched, so it has no profile; free it by a range"
             raise file.error(("profile",), problem)
+
+
+def _beyond_limits(file: YamlFile, fixed: Mapping[str, Any], model: ProcessModel) -> list[Mistake]:
+    """Fixed numbers that a parameter of the model cannot have."""
+    mistakes: list[Mistake] = []
+    for name, value in fixed.items():
+        if name not in model.parameter_names or not isinstance(value, int | float):
+            continue
+        try:
+            model.with_parameters(**{name: {"nominal": float(value), "fixed": True}})
+        except ModelError as error:
+            mistakes += file.error(("fixed", name), str(error)).mistakes
+    return mistakes
 
 
 def _try_space(file: YamlFile, key: tuple[str, ...], *args: Any, **more: Any) -> SearchSpace:

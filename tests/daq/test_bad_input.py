@@ -337,6 +337,11 @@ CASES = [
              "id.yaml:4:11: initial.zz: model actuator has no such name",
              "id.yaml:5:8: tied.c1: parameter c1: 'c0 * unknown' is no multiple of another",
              "id.yaml:6:1: profile: nonsense: model actuator has no such name"),
+    settings("values that are wrong beside keys that nobody knows",
+             "fixed: {R_m: -5}\npopulaton: 9\nranges: {L_m: [5, 1]}\n",
+             "id.yaml:1:9: fixed.R_m: parameter R_m: nominal value -5.0 is outside its physical",
+             "id.yaml:2:1: populaton: unknown key",
+             "id.yaml:3:10: ranges.L_m: low end 5 is not below high end 1"),
     settings("additions, channels, data sheets and results of before that are wrong, all at once",
              "terms: [{equation: omega, of: omgea, scale: 1, shape: sign, range: [-1, 1]}]\n"
              "channels: {lod: {gain: [0.5, 2]}, trque: {gain: [0.5, 2]}}\n"
