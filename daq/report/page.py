@@ -22,6 +22,7 @@ TOPICS = (
 )  # fmt: skip
 _CODE = re.compile("`([^`]+)`")  # what is typed, in sentences
 _JOINT = re.compile(r"(?<=[-_,:/])(?=\w)")  # where a long name may be broken
+_OPTION = re.compile(r"(?<!\S)(--[\w-]+)")  # of a command: not to be broken behind its hyphens
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -74,6 +75,7 @@ def rendered(
         "plain": lambda value: Markup(notation.number_html(notation.shortest(value))),
         "of": _of,
         "sized": _sized,
+        "command": lambda text: Markup(_OPTION.sub(r"<b>\1</b>", str(escape(text)))),
         "jointed": lambda name: Markup(_JOINT.sub("<wbr>", str(escape(name)))),
         "percent": lambda value: _marked(value, notation.percent),
         "marked": lambda text: Markup(_CODE.sub(r"<code>\1</code>", str(escape(text)))),

@@ -349,6 +349,7 @@ def test_a_serial_rig_wants_its_port_before_anything_is_recorded_and_not_to_be_c
     checked = rig("check", "e.yaml", "--rig", "serial.yaml", cwd=tmp_path)
     assert checked.returncode == 0, checked.stderr
     assert "Next: rig run e.yaml --rig serial.yaml --port PORT" in checked.stdout
+    assert "No port is named in the rig's file" in checked.stdout
     result = rig("run", "e.yaml", "--rig", "serial.yaml", cwd=tmp_path)
     assert result.returncode == 2
     assert "options.port: no port is named; give --port PORT" in result.stderr
