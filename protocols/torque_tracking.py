@@ -61,7 +61,8 @@ class TorqueTracking(ReferenceExperiment):
         remarks = (
             *self.controller_remarks(),
             "Hold the handle, and turn it as you like: the torque is felt against your hand. With "
-            "nobody at it the shaft runs away until a limit ends the run.",
+            "nobody at it the shaft runs away until a limit ends the run; a simulated hand is in "
+            "moving_hand.yaml.",
         )
         return Plan(n_samples, lowest, highest, references=reference, remarks=remarks)
 

@@ -49,7 +49,8 @@ class Transparency(ReferenceExperiment):
         remarks = (
             *self.controller_remarks(),
             "Hold the handle, and turn it to and fro alike in all blocks; every "
-            f"{self.block:g} s the controller comes or goes.",
+            f"{self.block:g} s the controller comes or goes. A simulated hand is in "
+            "moving_hand.yaml.",
         )
         reference = {"controlled": self.share(n_samples)}
         return Plan(n_samples, lowest, highest, references=reference, remarks=remarks)

@@ -38,7 +38,12 @@ class VirtualWall(WallSettings):
         seconds = self.patience + len(self.cells) * cell + self.rest.time
         n_samples = self.samples_in(seconds, "stiffnesses")
         bounds = command_bounds(self.motor_limit, self.brake_commands)
-        remarks = tuple(self._passivity(brake) for brake in self.brake_commands)
+        passivity = (self._passivity(brake) for brake in self.brake_commands)
+        remarks = (
+            *passivity,
+            "All others are tried as well: hold the handle firmly, and be ready to let go. A "
+            "simulated hand is in hand.yaml.",
+        )
         if self.is_controlled:
             lowest, highest = self.bounds()
             highest[1] = max(highest[1], *self.brake_commands)
@@ -174,6 +179,5 @@ class VirtualWall(WallSettings):
         return (
             f"Passive by {name}{with_brake}: b = {theory.damping(brake):.3g} N*m*s/rad > K T / 2 + "
             f"|B| holds up to K = {theory.passive_stiffness(brake, 0.0):.3g} N*m/rad without "
-            f"damping; {passive} of the {total} walls are. "
-            "The others are tried all the same: hold the handle firmly, and be ready to let go."
+            f"damping; {passive} of the {total} walls are."
         )

@@ -157,7 +157,8 @@ def test_the_plan_says_what_is_passive_before_anything_moves():
         stiffnesses=[1, 2, 4], dampings=[0, 0.001], brake_commands=[0, 0.1],
         body={"damping": 0.002, "brake_damping": 0.01},
     )  # fmt: skip
-    without, with_brake = plan(settings, RigConfig()).remarks
+    without, with_brake, warning = plan(settings, RigConfig()).remarks
+    assert "hold the handle firmly" in warning and "hand.yaml" in warning
     # 2 (b - B) / T: 3.2 and 1.6 N*m/rad without the brake, 4.8 and 3.2 with its 0.001 more.
     assert "(1.1)" in without and "K = 3.2 N*m/rad" in without and "3 of the 6" in without
     drawn = settings.preview()
