@@ -84,6 +84,18 @@ class Intervals:
         whole = np.hstack(signals)
         return np.hstack([whole[:-1], whole[1:, self.changing]])
 
+    def held(self, inputs: FloatArray) -> FloatArray:
+        """As of ``causes``, of inputs (n_samples, n_inputs) that stay as they are for an interval.
+
+        >>> from sysid.examples import lag
+        >>> u = np.array([[1.0], [2.0], [0.0]])
+        >>> Intervals(lag().with_holds({"u": "foh"}), lag().nominal, u, 0.1, 1).held(u).tolist()
+        [[1.0, 0.0, 1.0, 0.0], [2.0, 0.0, 2.0, 0.0]]
+        """
+        whole = np.zeros((len(inputs) - 1, len(self.model.inputs) + len(self.model.states)))
+        whole[:, : inputs.shape[1]] = inputs[:-1]
+        return np.hstack([whole, whole[:, self.changing]])
+
     def run(self, start: FloatArray) -> FloatArray:
         """States (n_samples, n_states) of a free run from where it begins, (n_states,)."""
         signals = np.repeat(self._signals(self.causes(self.inputs)), LANES, axis=1)

@@ -55,20 +55,24 @@ class LinearResponse:
         outputs: FloatArray | None = None,
         start: FloatArray | None = None,
         vector: FloatArray | None = None,
+        held: FloatArray | None = None,
     ) -> FloatArray:
         """Changes of the outputs, or of what is kept of the innovations, (n_samples, n_outputs).
 
         By what is added to rates, (n_samples, n_states), straight from sample to sample, to inputs,
         (n_samples, n_inputs), and to outputs, (n_samples, n_outputs); start: (n_states,), by where
         the states begin elsewhere; vector: (n_parameters,), by what is added to the equations'
-        parameters. Behind the model's states and outputs stand integrals of those that are
-        averaged, which may be left out.
+        parameters; held: (n_samples, n_inputs), by what is added to inputs from each sample to the
+        next. Behind the model's states and outputs stand integrals of those that are averaged,
+        which may be left out.
         """
         n, _, m = self.rows.shape
         pushes, first = np.zeros((n, m)), np.zeros(m)
         if rates is not None or inputs is not None:
             causes = self.slopes.intervals.causes(inputs, rates)
             _push(pushes, self.slopes.by_causes, causes)
+        if held is not None:
+            _push(pushes, self.slopes.by_causes, self.slopes.intervals.held(held))
         if vector is not None:
             _push(pushes, self.slopes.by_parameters, np.tile(vector, (n - 1, 1)))
         if start is not None:

@@ -57,11 +57,13 @@ def of_free_runs(local: Sensitivity) -> tuple[Sensitivity, list[DisturbedRun], B
         runs.append(DisturbedRun.free(model, vector, record, start, local.steps[k], workers))
     scales, none = objective.scales_of_each, np.zeros(local.residual.shape)
     zeros = np.stack([none, *(zero * scales for zero in zero_errors(local))], axis=2)
+    inexact = _simulation_error(runs, local)
+    local = replace(local, residual=local.residual + _between_samples(runs, local) / scales)
     return (
         local,
         runs,
         Background(
-            _felt(_foreseen_noise(runs), _simulation_error(runs, local)),
+            _felt(_foreseen_noise(runs), inexact),
             np.concatenate(
                 [zeros[..., 1:], _noisy_starts(runs, local), _moved_windows(runs, "its")], axis=2
             ),
@@ -187,6 +189,20 @@ def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> Float
     size = np.sqrt(np.mean(error[..., 0] ** 2, axis=0))
     left = np.sqrt(np.mean(local.residual**2, axis=0)) * np.mean(local.objective.scales, axis=0)
     return error if np.any(size > _INEXACT * left) else error[..., :0]
+
+
+def _between_samples(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
+    """What runs miss that take inputs for straight lines and averaged outputs for parabolas.
+
+    (n_rows, n_outputs), 0 where a sample was lost. It comes again with the inputs: of a right model
+    it would be laid to a channel that is late.
+    """
+    simulator, pieces = local.objective.simulator, []
+    for run, n_steps in zip(runs, local.steps, strict=True):
+        vector, start = run.vector[None], run.start[None]
+        beyond = simulator.beyond_parabolas(vector, run.record, n_steps, start)[0]
+        pieces.append(run.reacted() + np.where(np.isfinite(beyond), beyond, 0.0))
+    return np.where(local.seen, np.concatenate(pieces), 0.0)
 
 
 def _coarseness(objective: Innovations, local: Sensitivity) -> FloatArray:

@@ -16,6 +16,7 @@ from sysid.arrays import FloatArray
 from sysid.engine.linear_response import LinearResponse, feedthrough, free_response, observed
 from sysid.engine.trace import rates_along
 from sysid.engine.windows import average, with_integrals
+from sysid.fitting.reactions import with_reactions
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.problem.preparation import at_places
@@ -101,6 +102,13 @@ class DisturbedRun:
     def logged(self, outputs: FloatArray) -> FloatArray:
         """Change by what is logged of the outputs beside what they are: that itself."""
         return outputs
+
+    def reacted(self) -> FloatArray:
+        """Change of the outputs by what inputs on which states react are but straight lines."""
+        record = with_reactions(self.model, self.record, self.vector, self.start)
+        if not record.between.size:
+            return np.zeros_like(self.outputs)
+        return self._change(self.response.of(held=record.between))
 
     def started(self, place: int) -> FloatArray:
         """Change of the outputs per unit of where a state starts, (n_samples, n_outputs)."""

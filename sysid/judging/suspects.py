@@ -49,6 +49,7 @@ _FILTERS = (1.0, 5.0)  # time constants of filters that are tested [samples]
 _PLAYS = (0.02, 0.1)  # parts of an input's peak
 _RECORD = 0.1  # of a record, beyond which no delay is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
+_CLEAR = 3.0  # times the noise's power at a frequency, as chance makes in one of twenty
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
 # How a parameter may change with the size, up to 1, of what it multiplies: with it, with its
 # square, and near its zero.
@@ -231,13 +232,13 @@ def _lagging(run: DisturbedRun, i: int, time: float) -> FloatArray:
 
 
 def _acting(run: DisturbedRun, i: int) -> FloatArray:
-    """An input (n_samples,) without what of it is likely to be noise, which has not acted.
+    """What of an input (n_samples,) stands out of its noise, which has not acted.
 
     How the noise would be shifted seems to tell a delay far better than the signal does, and what
     it does by its second power, next to nothing, to be one.
     """
     signal, deviation = run.record.inputs[:, i], float(run.record.input_noise[i])
-    return signal - likely_noise(signal, deviation, float(run.colour[i])) if deviation else signal
+    return standing_out(signal, deviation, float(run.colour[i])) if deviation else signal
 
 
 _LATE_INPUTS: dict[Kind, _Change] = {
@@ -300,11 +301,38 @@ def likely_noise(signal: FloatArray, deviation: float, colour: float = 0.0) -> F
     padded = np.pad(power, width, mode="reflect") if len(power) > width else power
     kernel = np.ones(2 * width + 1) / (2 * width + 1)
     smooth = np.convolve(padded, kernel, "valid") if len(padded) > len(power) else power
-    turn = np.exp(-2j * np.pi * np.arange(len(power)) / n)
-    noise_power = deviation**2 * (1.0 - colour**2) / np.abs(1.0 - colour * turn) ** 2
-    share = np.minimum(noise_power / np.maximum(smooth, 1e-300), 1.0)
+    share = np.minimum(_noise_power(n, deviation, colour) / np.maximum(smooth, 1e-300), 1.0)
     likely: FloatArray = np.fft.irfft(spectrum * share, n)
     return likely
+
+
+def standing_out(signal: FloatArray, deviation: float, colour: float = 0.0) -> FloatArray:
+    """What of a signal (n,) is not likely to be its noise at frequencies where it stands out of it.
+
+    What a Wiener filter keeps between the lines of a signal's spectrum is noise, which drives a
+    free run as well: shifted, it goes with the errors that it makes there. Arguments as of
+    ``likely_noise``.
+
+    >>> rng = np.random.default_rng(0)
+    >>> noise, wave = 0.5 * rng.standard_normal(1000), np.sin(0.02 * np.pi * np.arange(1000))
+    >>> bool(standing_out(noise, 0.5).std() < 0.1)
+    True
+    >>> bool((standing_out(wave + noise, 0.5) - wave).std() < 0.1)
+    True
+    """
+    n, mean = len(signal), signal.mean()
+    power = np.abs(np.fft.rfft(signal - mean)) ** 2 / n
+    clear = power > _CLEAR * _noise_power(n, deviation, colour)
+    kept = np.fft.rfft(signal - likely_noise(signal, deviation, colour) - mean)
+    standing: FloatArray = mean + np.fft.irfft(np.where(clear, kept, 0.0), n)
+    return standing
+
+
+def _noise_power(n: int, deviation: float, colour: float) -> FloatArray:
+    """Of noise in n samples, at each frequency of their spectrum."""
+    turn = np.exp(-2j * np.pi * np.arange(n // 2 + 1) / n)
+    power: FloatArray = deviation**2 * (1.0 - colour**2) / np.abs(1.0 - colour * turn) ** 2
+    return power
 
 
 _Fault = tuple[Kind, Callable[[DisturbedRun], FloatArray]]

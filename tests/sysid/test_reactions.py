@@ -7,6 +7,7 @@ import pytest
 
 from sysid import GASSI, Dataset, Input, ModelError, Output, Parameter, ProcessModel, State
 from sysid.fitting.reactions import with_reactions
+from sysid.judging.examination import suspected
 
 LAG, INERTIA, BEHIND, DT, NOISE = 1e-3, 2.0, 0.1, 2e-3, 0.005
 N = 800
@@ -27,9 +28,10 @@ def rotor(reaction):
     )
 
 
-def log(rng, noise):
+def log(rng, noise, command=None):
     """Both inertias driven by steps, in closed form."""
-    command = np.resize([1.0, -1.0], N) * rng.uniform(0.5, 1.5, N)
+    if command is None:
+        command = np.resize([1.0, -1.0], N) * rng.uniform(0.5, 1.5, N)
     drive, omega, fall = np.zeros(N), np.zeros(N), np.exp(-DT / LAG)
     for k in range(N - 1):
         away = drive[k] - command[k]
@@ -68,3 +70,40 @@ def test_an_inertia_is_right_where_its_torque_reacts():
     settings = {"criterion": "innovations", "population": 8, "generations": 1, "random_state": 0}
     estimator = GASSI(rotor(BEHIND), **settings).fit([record])
     assert abs(estimator.parameters_["J"] / INERTIA - 1.0) < 0.002  # 0.02 with straight lines
+
+
+def log_of_means(seed):
+    """As ``log``, of means of the speed over times that end within samples."""
+    rng = np.random.default_rng(seed)
+    command = np.repeat(rng.uniform(-1.5, 1.5, N // 2), 2)
+    record, drive = log(rng, NOISE, command)
+    fall = np.exp(-DT / LAG)
+    speed = np.zeros(N)
+    for k in range(N - 1):
+        area = command[k] * DT + (drive[k] - command[k]) * LAG * (1.0 - fall)
+        speed[k + 1] = speed[k] + area / (INERTIA + BEHIND)
+
+    def way(k, time):
+        """The angle's change in a time from sample k on."""
+        away = (drive[k] - command[k]) * LAG
+        whole = 0.5 * command[k] * time**2 + away * (time - LAG * (1.0 - np.exp(-time / LAG)))
+        return speed[k] * time + whole / (INERTIA + BEHIND)
+
+    before = np.arange(N - 1)
+    begin, end = rng.uniform(0.0, 0.2, N - 1) * DT, rng.uniform(0.4, 0.6, N - 1) * DT
+    means = np.append(0.0, (way(before, end) - way(before, begin)) / (end - begin))
+    windows = np.zeros((N, 1, 2))
+    windows[1:, 0] = np.column_stack([begin, end]) - DT
+    means += 1e-5 * rng.standard_normal(N)
+    return replace(record, outputs=means[:, None], windows=windows)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_runs_between_samples_is_no_fault_of_a_channel(seed):
+    """Torques are no straight lines there, and a speed whose drive steps is no parabola."""
+    record = log_of_means(seed)
+    settings = {"criterion": "innovations", "population": 8, "generations": 1, "random_state": 0}
+    estimator = GASSI(rotor(BEHIND), **settings).fit([record])
+    assert abs(estimator.parameters_["J"] / INERTIA - 1.0) < 0.002
+    suspicion = suspected(estimator, estimator.uncertainty([record]), [record])
+    assert suspicion.findings == ()
