@@ -17,8 +17,9 @@ from sysid.uncertainty.colour import record_rows
 # Central differences in search coordinates: truncation and rounding both near 1e-8.
 _PERTURBATION = 1e-5
 _FILTER_PERTURBATION = 1e-6  # the same where kinks make a filter jump: fewer lie within less
-# Part of the larger slopes by which those of both sides differ where there is a kink between them.
-_KINK = 0.01
+# Part of the larger slopes by which those of both sides differ where there is a kink between them,
+# and how many times as far one looks then which of them a jump has made.
+_KINK, _FARTHER = 0.01, 100.0
 # Realisations of the inputs' noise in all records together, and the fewest of one record: they
 # give a variance to within 12 % and 25 %.
 _DRAWS, _FEWEST_DRAWS = 128, 32
@@ -97,8 +98,8 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     All simulations of a record take as many steps as the most demanding of them needs. Where one
     on one side fails the difference is that on the other side; where both do the slope is zero.
     Where noise of inputs divides the free run's errors it is held: at kinks of the equations it
-    jumps, which differences would take for slopes. So do a filter's corrections: of a parameter
-    whose slopes differ between the sides that side counts that has no jump.
+    jumps, which differences would take for slopes. So do a filter's corrections: of each residual
+    that side counts whose slope is the same farther away.
     """
     share: FloatArray | float = 1.0
     criterion, corrects = objective, filters(objective)
@@ -117,9 +118,13 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     sides = runs[:n].astype(int) + runs[n:]
     slopes = (changes[..., :n] - changes[..., n:]) / (np.maximum(sides, 1) * distance)
     if corrects:
-        ahead, behind = changes[..., :n] / distance, -changes[..., n:] / distance
-        for rows in record_rows(tuple(record.n_samples for record in objective.records)):
-            slopes[rows] = _without_jumps(slopes[rows], ahead[rows], behind[rows])
+        near = np.stack([changes[..., :n], -changes[..., n:]]) / distance
+        kinks = np.flatnonzero(_kinks(*near) & (sides == 2))
+        moves = _FARTHER * shift[kinks]
+        around = objective.space.decode(np.concatenate([at + moves, at - moves]))
+        ahead, behind = np.split(objective.residuals(around, steps).values - centre, 2, axis=-1)
+        far = np.stack([ahead, -behind]) / (_FARTHER * distance[kinks])
+        slopes[..., kinks] = _without_jumps(near[..., kinks], far)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
     factors = np.broadcast_to(share, seen.shape)
     residual, slopes = factors * centre[..., 0], factors[..., None] * slopes
@@ -144,14 +149,25 @@ def slopes_along(local: Sensitivity, directions: FloatArray) -> FloatArray:
     return slopes
 
 
-def _without_jumps(slopes: FloatArray, ahead: FloatArray, behind: FloatArray) -> FloatArray:
-    """Slopes of one record, those of the smaller side where the sides are a kink apart."""
-    apart = np.linalg.norm(ahead - behind, axis=(0, 1))
-    sizes = [np.linalg.norm(side, axis=(0, 1)) for side in (ahead, behind)]
-    jumps = apart > _KINK * np.maximum(*sizes)
-    smaller = np.where(sizes[0] < sizes[1], ahead, behind)
-    # A side on which the simulation fails has no slope at all.
-    return np.where(jumps & (np.minimum(*sizes) > 0.0), smaller, slopes)
+def _kinks(ahead: FloatArray, behind: FloatArray) -> BoolArray:
+    """Which parameters' slopes differ between both sides, (n_free,)."""
+    size = np.maximum(*(np.linalg.norm(side, axis=(0, 1)) for side in (ahead, behind)))
+    kinks: BoolArray = np.linalg.norm(ahead - behind, axis=(0, 1)) > _KINK * size
+    return kinks
+
+
+def _without_jumps(near: FloatArray, far: FloatArray) -> FloatArray:
+    """Slopes by differences over a distance and over a longer one, each (2, ...) on both sides.
+
+    A jump is seen as a slope that goes with the distance's inverse. Where both sides agree least
+    badly their mean counts, else the side on which both distances agree better.
+    """
+    (ahead, behind), unsteady = near, np.abs(near - far)
+    unsteady = np.where(np.isfinite(unsteady), unsteady, np.inf)
+    side = np.where(unsteady[0] <= unsteady[1], ahead, behind)
+    mean = 0.5 * (ahead + behind)
+    slopes: FloatArray = np.where(np.abs(ahead - behind) <= unsteady.min(axis=0), mean, side)
+    return slopes
 
 
 def spans(objective: Objective, chromosome: FloatArray) -> FloatArray:

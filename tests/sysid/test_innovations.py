@@ -684,6 +684,36 @@ def test_where_a_filter_jumps_slopes_are_those_of_the_side_without():
     assert np.abs(slopes[:, 1]).max() < 10.0 * size
 
 
+def test_where_a_filter_jumps_on_both_sides_each_residual_has_its_own():
+    """Of two states next to a kink one jumps where it is moved up, the other where down."""
+    beside = 5e-7
+    model = ProcessModel(
+        name="kinked twice",
+        states=tuple(
+            State(name, "1", initial=1.0 + part, first_sample=False)
+            for name, part in (("y", beside), ("z", -beside))
+        ),
+        inputs=(Input("u", "1"), Input("v", "1")),
+        outputs=(Output("y", "1"), Output("z", "1")),
+        parameters=(
+            Parameter("rate", "1/s", 5.0, 0.5, 50.0, "log"),
+            Parameter("kink", "1", 1.0, 0.1, 10.0, "log"),
+        ),
+        derivative=lambda x, u, p: (
+            u[0] - p[0] * max(x[0] - p[1], 0.0),
+            u[1] - p[0] * max(x[1] - p[1], 0.0),
+        ),
+    )
+    outputs = 1.0 + 0.1 * np.random.default_rng(0).standard_normal((60, 2))
+    record = Dataset(np.zeros((60, 2)), outputs, DT, input_noise=np.ones(2))
+    objective = Objective(BatchSimulator(model), SearchSpace.of(model), [record])
+    corrected = Innovations.of(objective, np.full(2, 0.1), corrects=True)
+    at = np.array([5.0, 1.0])
+    slopes = sensitivity(corrected, at).slopes
+    size = corrected.residuals(at[None], [8]).values.max()
+    assert np.abs(slopes[..., 1]).max() < 10.0 * size
+
+
 def test_little_noise_of_an_output_is_found_beside_what_that_of_an_input_does():
     """Plain rounds change it by little each, and would stop above."""
     rng, truth = np.random.default_rng(3), 0.02
