@@ -9,6 +9,7 @@ from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.bends import in_parts, splines_of, with_bends
 from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
 from sysid.engine.filter_kernel import FilterKernel
+from sysid.engine.filter_settings import FilterSettings
 from sysid.engine.intervals import Intervals, IntervalSlopes
 from sysid.engine.linear_response import LinearResponse, filter_response
 from sysid.engine.scheme import LANES, work_area
@@ -192,14 +193,7 @@ class RecordSimulator:
     def innovations(
         self,
         kalman: Filter,
-        noise: FloatArray,
-        scatter: FloatArray,
-        trust: FloatArray,
-        process: FloatArray,
-        colour: FloatArray,
-        corrects: bool,
-        exact: bool,
-        beyond: FloatArray | None,
+        settings: FilterSettings,
         parameters: FloatArray,
         starts: FloatArray | None,
         lanes: IntArray,
@@ -209,45 +203,40 @@ class RecordSimulator:
     ) -> tuple[FloatArray, FloatArray]:
         """As ``residuals``, of the innovations of a filter, in parts of the outputs' noise.
 
-        noise: (n_outputs,), standard deviations; scatter: (n_samples, n_outputs), variances of
-        single samples beside it; trust: of that shape, factors of what is kept of the innovations.
-        process: (n_states,), standard deviations of the states' rates
-        over the root of a second. colour: (n_inputs,), how much of the inputs' noise goes on from
-        sample to sample. corrects: whether the filter takes outputs in. exact: whether means are
-        what free runs say, of outputs that are no parabolas between samples; beyond: (n_samples,
-        n_outputs, n), what these say, where it is known. A state that starts at the first sample
-        of an output has that sample's error. traces: filled with the kernel's work area before
-        each sample's outputs, (n_samples, work_rows), and its states after them. Returns with the
-        sums of squares those of the logarithms of the innovations' variances in parts of the
-        outputs', (n, n_outputs).
+        A state that starts at the first sample of an output has that sample's error. traces: filled
+        with the kernel's work area before each sample's outputs, (n_samples, work_rows), and its
+        states after them. Returns with the sums of squares those of the logarithms of the
+        innovations' variances in parts of the outputs', (n, n_outputs).
         """
         record, kernel, model = self.record, kalman.kernel, self.kernels.model
         padded = lanes.take(_ALL_LANES, mode="wrap")
         first = [*self._starting, *[None] * kernel.n_states]
-        (mean, cut), weights = self._taken_in(kernel, trust, corrects)
-        variances = noise**2 + scatter
+        (mean, cut), weights = self._taken_in(kernel, settings)
+        unit, variances = self._variances(settings)
         spread = [0.0 if (j := first[i]) is None else variances[0, j] for i in kernel.reached]
-        intensity = process[list(kernel.variation.driven)] ** 2 / record.dt
-        of_inputs = record.input_noise[list(kernel.variation.noisy)] ** 2
+        driven, noisy = list(kernel.variation.driven), list(kernel.variation.noisy)
+        process = np.broadcast_to(settings.process, len(model.states))
+        intensity = process[driven] ** 2 / record.dt
+        of_inputs, colour = record.input_noise[noisy] ** 2, self._colour(settings)[noisy]
         start = np.zeros((kernel.n_states, LANES))
         start[: len(model.states)] = self._initial(starts, padded)
-        kept = np.empty((record.n_samples, len(noise), LANES))
-        sums = np.empty((2 * len(noise), LANES))
+        kept = np.empty((*variances.shape, LANES))
+        sums = np.empty((2 * variances.shape[1], LANES))
         work = work_area(kernel.work_rows * LANES)
         inputs = self._inputs_of.get(tuple(kernel.splines))
         if inputs is None:  # the same in every run of a fit
             inputs = with_bends(model, record, kernel.splines)
             self._inputs_of[tuple(kernel.splines)] = inputs
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
-        if beyond is not None:
-            measured[..., : len(lanes)] -= beyond
-        elif exact:
+        if settings.beyond is not None:
+            measured[..., : len(lanes)] -= settings.beyond[..., lanes]
+        elif settings.exact:
             measured -= self.beyond_parabolas(parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, inputs, measured, weights,
-                variances, noise**2, mean, of_inputs, colour[list(kernel.variation.noisy)],
-                intensity, np.array(spread), float(corrects), start,
+                variances, unit, mean, of_inputs, colour, intensity, np.array(spread),
+                float(settings.corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept, *traces,
             )  # fmt: skip
         values[..., _neighbours(lanes)] = kept[..., : len(lanes)]
@@ -255,52 +244,50 @@ class RecordSimulator:
         return sse, logarithms
 
     def _taken_in(
-        self, kernel: FilterKernel, trust: FloatArray, corrects: bool
+        self, kernel: FilterKernel, settings: FilterSettings
     ) -> tuple[_Means, FloatArray]:
         """As of ``_means``, and weights (n_samples, n_outputs) of what a filter takes in."""
-        key = tuple(kernel.averaged), corrects
+        key = tuple(kernel.averaged), settings.corrects
         if key not in self._means_of:  # the same in every run of a fit
             self._means_of[key] = self._means(*key)
-        means, weights = self._means_of[key], self._weights * trust
+        means, weights = self._means_of[key], self._weights * settings.trust
         starting = [j for j in self._starting if j is not None]
         over = [j for j in self.averaged if j not in means[1]]
         weights[0, starting + over] = 0.0  # of the latter no mean is over yet
         return means, weights
 
+    def _variances(self, settings: FilterSettings) -> tuple[FloatArray, FloatArray]:
+        """Variances of the outputs, (n_outputs,), and of each sample, (n_samples, n_outputs)."""
+        unit = settings.noise**2
+        each = np.broadcast_to(unit + settings.scatter, self._measured.shape)
+        return unit, np.ascontiguousarray(each)
+
+    def _colour(self, settings: FilterSettings) -> FloatArray:
+        return np.broadcast_to(settings.colour, len(self.record.input_noise))
+
     def filter_response(
         self,
         kalman: Filter,
-        noise: FloatArray,
-        scatter: FloatArray,
-        trust: FloatArray,
-        process: FloatArray,
-        colour: FloatArray,
-        corrects: bool,
-        exact: bool,
-        beyond: FloatArray | None,
+        settings: FilterSettings,
         vector: FloatArray,
         start: FloatArray,
         n_steps: int,
     ) -> LinearResponse:
-        """How innovations answer disturbances under parameters (n_parameters,) from a start.
-
-        Other arguments as of ``innovations``.
-        """
+        """How innovations answer disturbances under parameters (n_parameters,) from a start."""
         kernel, record = kalman.kernel, self.record
         n, n_states = record.n_samples, kernel.variation.n_states
         before, after = np.zeros((n, kernel.work_rows)), np.zeros((n, n_states))
-        values = np.empty((n, len(noise), 1))
+        unit, variances = self._variances(settings)
         self.innovations(
-            kalman, noise, scatter, trust, process, colour, corrects, exact, beyond,
-            vector[None], start[None], np.zeros(1, dtype=np.int64), n_steps, values,
-            (before, after),
+            kalman, settings, vector[None], start[None], np.zeros(1, dtype=np.int64), n_steps,
+            np.empty((*variances.shape, 1)), (before, after),
         )  # fmt: skip
         intervals = Intervals(kalman.model, vector, record.inputs, record.dt, n_steps)
-        mean, _ = self._means(self.averaged, corrects)
+        mean, _ = self._means(self.averaged, settings.corrects)
         return filter_response(
             kernel, self.averaged, IntervalSlopes(intervals, after), before, mean,
-            self._taken_in(kernel, trust, corrects)[1], noise**2 + scatter, noise**2,
-            colour[list(kernel.variation.noisy)], corrects,
+            self._taken_in(kernel, settings)[1], variances, unit,
+            self._colour(settings)[list(kernel.variation.noisy)], settings.corrects,
         )  # fmt: skip
 
     def tangents(

@@ -11,6 +11,7 @@ import numpy as np
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.bends import bent
 from sysid.engine.compiler import Filter, kalman_filter, kernels, tangents
+from sysid.engine.filter_settings import FilterSettings
 from sysid.engine.linear_response import LinearResponse
 from sysid.engine.record_simulator import RecordSimulator, blocks_of
 from sysid.engine.scheme import LANES
@@ -212,59 +213,33 @@ class BatchSimulator:
         scales: Sequence[FloatArray],
         n_steps: IntArray,
         starts: Sequence[FloatArray | None],
-        noise: FloatArray,
+        settings: Sequence[FilterSettings],
         *,
-        scatter: Sequence[FloatArray] | None = None,
-        trust: Sequence[FloatArray] | None = None,
-        process: FloatArray | None = None,
-        colour: Sequence[FloatArray] | None = None,
-        corrects: bool = True,
-        exact: bool = False,
-        beyond: Sequence[FloatArray] | None = None,
         balanced: bool = True,
     ) -> Residuals:
         """As ``residuals``, of the innovations of an extended Kalman filter.
 
-        Noise of the inputs is the records' own; noise: (n_outputs,), standard deviations of the
-        outputs; scatter: per record, (n_samples, n_outputs), variances that single samples have
-        beside that; trust: per record, (n_samples, n_outputs), factors of the innovations, default
-        1, though all are taken in; process: (n_states,), intensities of the process's noise,
-        standard deviations of the states' rates over the root of a second; colour: per record,
-        (n_inputs,), parts of the inputs' noise that go on from sample to sample, default none. An
-        innovation is scaled by the output's noise over its own standard deviation: without noise
-        of inputs and process innovations are the residuals. With noise of the process, where
-        ``balanced``, all of an output are multiplied by the geometric mean of those deviations:
-        their sum of squares is then least where the likelihood of an output of unknown noise is
-        largest. Unless it ``corrects`` itself by the outputs, they are those of the free run,
-        scaled so. Averaged outputs are taken for parabolas between samples, unless means are to be
-        ``exact`` to what free runs tell of how they run there, or to ``beyond``, per record
-        (n_samples, n_outputs, n), as of ``beyond_parabolas``. See ``filter_kernel``. Raises
-        ModelError for equations that cannot be differentiated.
+        settings: per record; noise, process, and what is corrected, are those of all. An innovation
+        is scaled by the output's noise over its own standard deviation: without noise of inputs and
+        process innovations are the residuals. With noise of the process, where ``balanced``, all of
+        an output are multiplied by the geometric mean of those deviations: their sum of squares is
+        then least where the likelihood of an output of unknown noise is largest. See
+        ``filter_kernel``. Raises ModelError for equations that cannot be differentiated.
         """
-        process = np.zeros(len(self.model.states)) if process is None else process
-        driven = _driven(process)
-        white = np.zeros((len(records), len(self.model.inputs)))
-        colours = white if colour is None else np.asarray(colour)
-        kalman = self._filter(records, driven, bool(colours.any()))
-        logarithms = np.zeros((len(parameters), len(records), len(noise)))
-        if scatter is None:
-            scatter = [np.zeros(record.outputs.shape) for record in records]
-        if trust is None:
-            trust = [np.ones(record.outputs.shape) for record in records]
+        kalman = self._filter(records, settings)
+        logarithms = np.zeros((len(parameters), len(records), len(self.model.outputs)))
 
         def simulate(
             r: int, simulator: RecordSimulator, values: FloatArray, lanes: IntArray, steps: int
         ) -> tuple[FloatArray, FloatArray]:
-            shape = None if beyond is None else beyond[r][..., lanes]
             sse, logarithms[lanes, r] = simulator.innovations(
-                kalman, noise, scatter[r], trust[r], process, colours[r], corrects, exact, shape,
-                parameters, starts[r], lanes, steps, values,
-            )  # fmt: skip
+                kalman, settings[r], parameters, starts[r], lanes, steps, values
+            )
             return sse, np.where(np.isfinite(sse).all(axis=1), 0.0, np.inf)
 
         parameters = self._check(parameters, records)
         innovations = self._gathered(simulate, parameters, records, scales, n_steps, starts)
-        if not (driven and balanced):
+        if not (balanced and np.any(settings[0].process)):
             return innovations
         for r in range(len(records)):
             logarithms[:, r] = logarithms[_first_alike(parameters, starts[r], n_steps[:, r]), r]
@@ -283,36 +258,23 @@ class BatchSimulator:
         scale: FloatArray,
         n_steps: int,
         start: FloatArray,
-        noise: FloatArray,
-        *,
-        scatter: FloatArray,
-        trust: FloatArray,
-        process: FloatArray,
-        colour: FloatArray,
-        corrects: bool,
-        exact: bool,
-        beyond: FloatArray | None,
+        settings: FilterSettings,
     ) -> LinearResponse:
         """How innovations of a record answer what is added to the equations and the outputs.
 
         Of one parameter vector, (n_parameters,), from one start, (n_states,). Other arguments as of
         ``innovations``, for one record.
         """
-        kalman = self._filter([record], _driven(process), bool(colour.any()))
-        return self._on(record, scale).filter_response(
-            kalman, noise, scatter, trust, process, colour, corrects, exact, beyond, vector, start,
-            n_steps,
-        )  # fmt: skip
+        kalman = self._filter([record], [settings])
+        return self._on(record, scale).filter_response(kalman, settings, vector, start, n_steps)
 
-    def _filter(
-        self,
-        records: Sequence[Dataset],
-        driven: tuple[int, ...],
-        coloured: bool,
-    ) -> Filter:
+    def _filter(self, records: Sequence[Dataset], settings: Sequence[FilterSettings]) -> Filter:
         averaged = tuple(sorted({j for record in records for j in self._on(record).averaged}))
         model = bent(self.model) if all(record.between.size for record in records) else self.model
         model = with_integrals(model, averaged) if averaged else model
+        process = np.broadcast_to(settings[0].process, len(self.model.states))
+        driven = tuple(np.flatnonzero(process).tolist())
+        coloured = any(np.any(each.colour) for each in settings)
         return kalman_filter(model, noisy_inputs(records), driven, averaged, coloured)
 
     def beyond_parabolas(
@@ -486,11 +448,6 @@ class BatchSimulator:
 def _each_beside(points: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points (n, m) repeated for each of their directions (n, d, m), and these, (n d, m) each."""
     return np.repeat(points, directions.shape[1], axis=0), directions.reshape(-1, points.shape[1])
-
-
-def _driven(process: FloatArray) -> tuple[int, ...]:
-    """Places of the states that noise of the process, (n_states,), drives."""
-    return tuple(np.flatnonzero(process).tolist())
 
 
 def noisy_inputs(records: Sequence[Dataset]) -> tuple[int, ...]:

@@ -35,6 +35,7 @@ from typing import Any, Self, TypeGuard
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
+from sysid.engine.filter_settings import FilterSettings
 from sysid.engine.linear_response import LinearResponse
 from sysid.engine.simulation import BatchResult, Residuals, Status
 from sysid.fitting.averages import coloured, denoised
@@ -518,21 +519,13 @@ class Innovations(Objective):
 
         Changes are in parts of the outputs' scales.
         """
-        shape = None if self.shape is None else self.shape.of(self.space.encode(chromosome)[None])
         return self.simulator.filter_response(
             self.space.full(chromosome[None])[0],
             self.records[place],
             self.scales[place],
             n_steps,
             self._starts(chromosome[None])[place][0],
-            self.noise,
-            scatter=self.scatter[place],
-            trust=self.trust[place],
-            process=self.process,
-            colour=self.colour[place],
-            corrects=self.corrects,
-            exact=self.exact,
-            beyond=None if shape is None else shape[place],
+            self._settings(chromosome[None])[place],
         )
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
@@ -555,16 +548,23 @@ class Innovations(Objective):
             self.scales,
             steps,
             starts,
-            self.noise,
-            scatter=self.scatter,
-            trust=self.trust,
-            process=self.process,
-            colour=self.colour,
-            corrects=self.corrects,
-            exact=self.exact,
-            beyond=None if self.shape is None else self.shape.of(self.space.encode(chromosomes)),
+            self._settings(chromosomes),
             balanced=balanced,
         )
+
+    def _settings(self, chromosomes: FloatArray) -> list[FilterSettings]:
+        """Per record, those of a filter at chromosomes, (n, n_free)."""
+        beyond: Sequence[FloatArray | None] = [None] * len(self.records)
+        if self.shape is not None:
+            beyond = self.shape.of(self.space.encode(chromosomes))
+        return [
+            FilterSettings(
+                self.noise, scatter, trust, self.process, colour, self.corrects, self.exact, each
+            )
+            for scatter, trust, colour, each in zip(
+                self.scatter, self.trust, self.colour, beyond, strict=True
+            )
+        ]
 
 
 def filters(objective: Objective) -> TypeGuard[Innovations]:

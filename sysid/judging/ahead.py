@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sysid.engine.filter_settings import FilterSettings
 from sysid.engine.simulation import BatchSimulator, noisy_inputs
 from sysid.fitting.reactions import with_reactions
 from sysid.judging.disturbed import DisturbedRun
@@ -32,7 +33,8 @@ def compile_ahead(model: ProcessModel, record: Dataset) -> None:
     with suppress(ModelError):  # whatever fails is said where its result is wanted
         if noisy_inputs([head]):
             bent, noise = with_reactions(model, head, vector, start), np.ones(len(model.outputs))
-            simulator.innovations(vector[None], [bent], [noise], n_steps, [None], noise)
+            settings = [FilterSettings(noise)]
+            simulator.innovations(vector[None], [bent], [noise], n_steps, [None], settings)
     with suppress(ModelError):
         DisturbedRun.free(model, vector, head, start, 1, Workers(1))
     with suppress(ModelError):

@@ -22,6 +22,7 @@ from sysid import (
     SearchSpace,
     State,
 )
+from sysid.engine.filter_settings import FilterSettings
 from sysid.fitting.averages import denoised, just_missed
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
@@ -96,8 +97,8 @@ def test_coloured_noise_of_an_input_is_that_of_a_kalman_filter_that_knows_its_co
         expected.append(e * OF_OUTPUT / np.sqrt(s))
     record = Dataset(u, y, DT, input_noise=np.array([OF_INPUT]))
     model = lag().with_holds({"u": hold})
-    colours = [np.array([colour])]
-    innovations = simulate(model, [GAIN, TAU], record, [OF_OUTPUT], steps=3, colour=colours)
+    settings = {"colour": np.array([colour])}
+    innovations = simulate(model, [GAIN, TAU], record, [OF_OUTPUT], steps=3, **settings)
     assert innovations[:, 0] == pytest.approx(expected, abs=1e-10)
 
 
@@ -178,12 +179,12 @@ def extended_kalman_filter(model, p, record, noise):
     return innovations
 
 
-def simulate(model, p, record, noise, steps, **options):
+def simulate(model, p, record, noise, steps, balanced=True, **settings):
     """Innovations (n_samples, n_outputs) at unit scale."""
     q = len(model.outputs)
     simulated = BatchSimulator(model).innovations(
-        np.array([p]), [record], [np.ones(q)], np.array([[steps]]), [None], np.array(noise),
-        **options,
+        np.array([p]), [record], [np.ones(q)], np.array([[steps]]), [None],
+        [FilterSettings(np.array(noise), **settings)], balanced=balanced,
     )  # fmt: skip
     return simulated.values[..., 0]
 

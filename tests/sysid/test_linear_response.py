@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sysid import BatchSimulator, Dataset
+from sysid.engine.filter_settings import FilterSettings
 from sysid.examples import lag
 
 DT, TAU, GAIN, SAMPLES = 0.02, 0.05, 2.0, 200
@@ -28,16 +29,11 @@ def filtered(record, vector=(GAIN, TAU), corrects=True, colour=0.5, hold="zoh"):
     model = lag().with_holds({"u": hold}).with_initial({"y": 0.0})
     simulator = BatchSimulator(model, threads=1)
     vector, scale, start = np.array(vector), np.ones(1), np.zeros(1)
-    colours, shape = np.array([colour]), record.outputs.shape
+    settings = FilterSettings(NOISE, colour=np.array([colour]), corrects=corrects)
     innovations = simulator.innovations(
-        vector[None], [record], [scale], np.array([[2]]), [start[None]], NOISE,
-        colour=[colours], corrects=corrects,
+        vector[None], [record], [scale], np.array([[2]]), [start[None]], [settings]
     ).values[..., 0]  # fmt: skip
-    response = simulator.filter_response(
-        vector, record, scale, 2, start, NOISE,
-        scatter=np.zeros(shape), trust=np.ones(shape), process=np.zeros(1), colour=colours,
-        corrects=corrects, exact=False, beyond=None,
-    )  # fmt: skip
+    response = simulator.filter_response(vector, record, scale, 2, start, settings)
     return innovations, response
 
 
@@ -104,18 +100,15 @@ def test_balance_by_the_process_is_the_mean_deviation_that_the_response_tells():
     )
     simulator, record = BatchSimulator(bent, threads=1), noisy_record()
     vector, scale, start, process = np.array([GAIN, TAU]), np.ones(1), np.zeros(1), np.array([0.5])
+    settings = FilterSettings(NOISE, process=process)
     plain, balanced = (
         simulator.innovations(
-            vector[None], [record], [scale], np.array([[1]]), [start[None]], NOISE,
-            process=process, balanced=wanted,
+            vector[None], [record], [scale], np.array([[1]]), [start[None]], [settings],
+            balanced=wanted,
         ).values[..., 0]
         for wanted in (False, True)
     )  # fmt: skip
-    response = simulator.filter_response(
-        vector, record, scale, 1, start, NOISE,
-        scatter=np.zeros(plain.shape), trust=np.ones(plain.shape), process=process,
-        colour=np.zeros(1), corrects=True, exact=False, beyond=None,
-    )  # fmt: skip
+    response = simulator.filter_response(vector, record, scale, 1, start, settings)
     seen = (plain != 0.0) & (response.kept > 0.0)
     deviation = np.exp(-np.sum(np.log(response.kept[seen])) / np.isfinite(record.outputs).sum())
     np.testing.assert_allclose(balanced[seen] / plain[seen], deviation, rtol=1e-6)

@@ -19,6 +19,7 @@ from sysid import (
     State,
 )
 from sysid.engine.filter_kernel import FilterKernel
+from sysid.engine.filter_settings import FilterSettings
 from sysid.examples import lag
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.means import each_mean_once, scatter
@@ -81,14 +82,21 @@ def test_the_filter_sees_them_alike(corrects):
     simulator, p = BatchSimulator(model), np.array([[0.9, 1.1 * TAU]])
     common = p, [record], [np.ones(1)], np.array([[4]]), [None]
     plain = simulator.residuals(*common).values
-    filtered = simulator.innovations(*common, np.array([0.1]), corrects=corrects).values
+    filtered = simulator.innovations(
+        *common, [FilterSettings(np.array([0.1]), corrects=corrects)]
+    ).values
     np.testing.assert_allclose(filtered[1:], plain[1:], atol=1e-6)
 
 
 def test_a_free_run_that_diverges_has_no_means_and_warns_of_none():
     record = replace(averaged_step(), input_noise=np.array([1e-9]))
     filtered = BatchSimulator(lag().with_initial({"y": 0.0})).innovations(
-        np.array([[1.0, -1e-6]]), [record], [np.ones(1)], np.array([[1]]), [None], np.ones(1)
+        np.array([[1.0, -1e-6]]),
+        [record],
+        [np.ones(1)],
+        np.array([[1]]),
+        [None],
+        [FilterSettings(np.ones(1))],
     )
     assert not np.isfinite(filtered.values).all()
 
@@ -106,7 +114,12 @@ def test_the_filter_of_means_is_made_once(monkeypatch):
     model = lag().with_initial({"y": 0.5})
     for tau in (TAU, 2.0 * TAU):
         BatchSimulator(model).innovations(
-            np.array([[1.0, tau]]), [record], [np.ones(1)], np.array([[1]]), [None], np.ones(1)
+            np.array([[1.0, tau]]),
+            [record],
+            [np.ones(1)],
+            np.array([[1]]),
+            [None],
+            [FilterSettings(np.ones(1))],
         )
     assert len(made) == 1
 
@@ -120,8 +133,8 @@ def test_of_means_over_the_last_sample_innovations_are_those_of_a_kalman_filter(
     record = Dataset(u, y, DT, input_noise=np.array([0.3]), windows=windows)
     scatter = rng.uniform(0.0, 0.1, (80, 1))
     filtered = BatchSimulator(lag().with_initial({"y": 0.0})).innovations(
-        np.array([[2.0, TAU]]), [record], [np.ones(1)], np.array([[1]]), [None], np.array([0.2]),
-        scatter=[scatter],
+        np.array([[2.0, TAU]]), [record], [np.ones(1)], np.array([[1]]), [None],
+        [FilterSettings(np.array([0.2]), scatter)],
     )  # fmt: skip
     # States are the output and the input's error at the sample before.
     x, P, fading = np.zeros(2), np.diag([0.0, 0.3**2]), np.exp(-DT / TAU)
@@ -158,7 +171,12 @@ def test_of_means_over_many_samples_innovations_are_those_of_their_joint_normal(
     np.testing.assert_allclose(once.outputs[rows, 0], means[told])
     assert 20 < len(rows) < 30  # of two that end within a sample one
     filtered = BatchSimulator(lag().with_initial({"y": 0.0})).innovations(
-        np.array([[2.0, TAU]]), [once], [np.ones(1)], np.array([[1]]), [None], np.array([0.2])
+        np.array([[2.0, TAU]]),
+        [once],
+        [np.ones(1)],
+        np.array([[1]]),
+        [None],
+        [FilterSettings(np.array([0.2]))],
     )
     # Area under the response to each sample's input, up to a time.
     since = np.maximum(np.stack([ends, begins])[:, told, None] - np.arange(80.0), 0.0) * DT
