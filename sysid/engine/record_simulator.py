@@ -259,8 +259,7 @@ class RecordSimulator:
     def _variances(self, settings: FilterSettings) -> tuple[FloatArray, FloatArray]:
         """Variances of the outputs, (n_outputs,), and of each sample, (n_samples, n_outputs)."""
         unit = settings.noise**2
-        each = np.broadcast_to(unit + settings.scatter, self._measured.shape)
-        return unit, np.ascontiguousarray(each)
+        return unit, np.full(self._measured.shape, unit + settings.scatter)
 
     def _colour(self, settings: FilterSettings) -> FloatArray:
         return np.broadcast_to(settings.colour, len(self.record.input_noise))
