@@ -57,6 +57,8 @@ _EXPLORED_BY_FILTER = 5  # the same by a filter
 _BETTER = 1.0  # deviance by which one of them has to be better than the one before
 
 Watch = Callable[[Point], None]
+# Whether a chromosome (n_free,) is far from minima, and others.
+_New = Callable[[FloatArray, Sequence[FloatArray]], bool]
 NoisyInputs = Literal["compensated", "innovations"]
 
 
@@ -292,7 +294,7 @@ def _refitted(
             optima = Optima.around(exact, fit.given, scale)
             (first,) = (best,) = (explored,) = optima.ranked()
         ends = _conceivable(first.objective, starts, optima, best)
-        for optimum in _compared(first.objective, ends):
+        for optimum in _compared(first.objective, ends, optima):
             optima.add(optimum)
         (best, *others), starts = optima.ranked(), []
         if filtered and optima.deviance(first, best) > TOLD_APART:
@@ -310,8 +312,8 @@ def _refitted(
     return optima
 
 
-def _compared(objective: Objective, ends: Sequence[Refinement]) -> list[Optimum]:
-    """Minima beside where descents have ended, as they are compared with ones far from them.
+def _compared(objective: Objective, ends: Sequence[Refinement], optima: Optima) -> list[Optimum]:
+    """New minima beside where descents have ended, as they are compared with ones far from them.
 
     Steps that do at one minimum may be too coarse at another, which then seems to be elsewhere.
     """
@@ -319,7 +321,10 @@ def _compared(objective: Objective, ends: Sequence[Refinement]) -> list[Optimum]
         return []
     finer = _fine_enough(objective, ends)
     begun = [begin(finer, end.chromosome) for end in ends]
-    chromosomes = [_inside(finer, end.chromosome) for end in refine_each(finer, begun)]
+    reached = refine_each(finer, begun, enough=partial(_known, finer, optima.new, ()))
+    chromosomes = [_inside(finer, end.chromosome) for end in reached if optima.new(end.chromosome)]
+    if not chromosomes:
+        return []
     errors = to_compare(objective).rms(np.stack(chromosomes))
     return [Optimum.of(objective, *pair) for pair in zip(chromosomes, errors, strict=True)]
 
@@ -412,7 +417,7 @@ def _conceivable_by(
 def _quickly(
     objective: Objective,
     starts: Sequence[FloatArray],
-    new: Callable[[FloatArray, Sequence[FloatArray]], bool],
+    new: _New,
 ) -> list[Refinement]:
     """Where descents come to soon that is new, also to those before them; others end on the way."""
     ends: list[Refinement] = []
@@ -435,7 +440,7 @@ def _quickly(
 
 def _known(
     objective: Objective,
-    new: Callable[[FloatArray, Sequence[FloatArray]], bool],
+    new: _New,
     before: Sequence[FloatArray],
     point: Point,
 ) -> bool:
