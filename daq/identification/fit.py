@@ -325,17 +325,13 @@ def assemble(
 
     faults: of the logs, where they have been looked for.
     """
-    # It loads scikit-learn, which takes a second and those that fit nothing do without.
-    from sysid.gassi import PRESETS
-
     datasets = [log.dataset for log in logs[0]]
-    refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
     uncertainty = None
-    if refined:
+    if estimator.is_refined_:
         watch(Progress("Intervals", 0, 1, "what the data determine"))
         uncertainty = estimator.uncertainty(datasets)
         watch(Progress("Intervals", 1, 1, "what the data determine"))
-    profiles, names = [], problem.settings.profile if refined else []
+    profiles, names = [], problem.settings.profile if estimator.is_refined_ else []
     for k, name in enumerate(names):
         watch(Progress("Profiles", k, len(names), f"of {name}"))
         profiles.append(estimator.profile(name, datasets))

@@ -460,6 +460,17 @@ class GASSI(RecordEstimator):
         return profile(self.final_objective(X, y, records), self.final_chromosome_, name)
 
     @property
+    def is_refined_(self) -> bool:
+        """Whether ``fit`` came to a minimum that can be simulated, so that it has intervals."""
+        ended = self._preset().refine and self.stopped_ != "interrupted"
+        return ended and not self._grows
+
+    @property
+    def _grows(self) -> bool:
+        """Whether free runs, of which the fit was, grow beyond all bounds where it ended."""
+        return self.output_noise_ is None and not np.isfinite(self.error_)
+
+    @property
     def rivals_(self) -> list[dict[str, float]]:
         """All the model's parameters in each further minimum that explains the data as well."""
         return [self._named(self.space_.full(rival)) for rival in self._rivals]
@@ -491,6 +502,11 @@ class GASSI(RecordEstimator):
             raise ModelError(f"preset {self.preset} has no local refinement, so no intervals")
         if self.stopped_ == "interrupted":
             raise ModelError("the identification was interrupted, so there are no intervals")
+        if self._grows:
+            raise ModelError(
+                "the model cannot be simulated where the fit ended, so there are no intervals: "
+                "narrow the ranges, or raise max_steps"
+            )
         data = self._records(X, y, records, None, reset=False)
         objective = self._objective(data)
         objective = objective if self._cut is None else self._cut.of_all(objective)

@@ -94,11 +94,12 @@ def moved_by_noise(
     uncertainty: Uncertainty,
     training: Sequence[Dataset],
 ) -> Finding:
-    """A finding of an input's noise, with what a fit that takes it out moves.
+    """A finding of an input's noise, with what a fit that takes it out moves and widens.
 
     A step from the minimum does not tell: what of an input is likely to be noise stands for its
-    fast changes as well, and may seem larger than its samples show. Without moves where the fit
-    fails.
+    fast changes as well, and may seem larger than its samples show. And slow noise far below an
+    output's own is not seen in the residuals' colour, but in what is estimated. Without moves where
+    the fit fails.
     """
     from sysid.gassi import GASSI
 
@@ -108,11 +109,14 @@ def moved_by_noise(
     noisy = [replace(r, input_noise=_raised(r.input_noise, place, size)) for r in training]
     try:
         fitted = GASSI(**{**estimator.get_params(deep=False), "criterion": "auto"}).fit(noisy)
+        deviations = {e.name: e.deviation for e in fitted.uncertainty(noisy).determined()}
     except ModelError:
         return replace(finding, amplitude=size, moves=())
     estimates = list(_shared(uncertainty, fitted.parameters_))
     changes = [e.at(fitted.parameters_) - e.value for e in estimates]
-    return replace(finding, amplitude=size, moves=moves_of(estimates, changes))
+    pairs = [(deviations.get(e.name), e.deviation) for e in estimates]
+    wider = max((with_it / alone for with_it, alone in pairs if with_it and alone), default=1.0)
+    return replace(finding, amplitude=size, moves=moves_of(estimates, changes), wider=wider)
 
 
 def _raised(noise: FloatArray, place: int, size: float) -> FloatArray:

@@ -368,10 +368,10 @@ def _follows(results: Sequence[RecordResult]) -> BoolArray:
 def _input_correlations(results: Sequence[RecordResult]) -> tuple[FloatArray, FloatArray]:
     """Chance of the residuals' correlations, all tests together, and their largest in the mean.
 
-    (n_outputs, n_inputs) each.
+    (n_outputs, n_inputs) each; chance is at least 1 where nothing is tested.
     """
     tests = sum(r.residuals.tested.sum() * len(r.residuals.chance) for r in results)
-    chance = tests * np.min([result.residuals.chance for result in results], axis=0)
+    chance = max(tests, 1) * np.min([result.residuals.chance for result in results], axis=0)
     sizes = np.mean([np.abs(result.residuals.cross).max(axis=0) for result in results], axis=0)
     return chance, sizes
 
@@ -546,6 +546,8 @@ def _moving(finding: Finding) -> str:
     ]
     chance, text = _chance(finding), description(finding)
     says = "The data ask for " if finding.amplitude is None else ""
+    if finding.widens:
+        moved.append(f"intervals {finding.wider:.1f} times as wide")
     effect = (
         f"with that {', '.join(moved)}"
         if moved

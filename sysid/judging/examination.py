@@ -10,7 +10,7 @@ from sysid.fitting.free_run import AccurateRun
 from sysid.fitting.innovations import MISJUDGED
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
-from sysid.gassi import GASSI, PRESETS
+from sysid.gassi import GASSI
 from sysid.judging.alternatives import Alternative, best_alternative, moved_by_noise
 from sysid.judging.assessment import RecordResult, Verdict, examine, judge
 from sysid.judging.exchanges import exchanged_channels
@@ -52,8 +52,7 @@ def verdict_of(
     >>> verdict_of(fitted, logs[:1], logs[1:]).trust
     'good'
     """
-    refined = PRESETS[estimator.preset].refine and estimator.stopped_ != "interrupted"
-    if refined and uncertainty is None:
+    if estimator.is_refined_ and uncertainty is None:
         uncertainty = estimator.uncertainty(list(training))
     trained, validated = (
         [examined(estimator, record, uncertainty)[1] for record in part]

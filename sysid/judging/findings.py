@@ -11,6 +11,7 @@ from sysid.uncertainty import Estimate
 # Standard deviations by which a finding moves a parameter noticeably: an interval reaches 1.96. And
 # share of the residuals that it explains, from where it counts whatever it moves.
 MOVED, _LARGE = 1.5, 0.25
+_WIDER = 1.25  # times as wide, from where intervals without the finding are too sure
 _NEARLY_ALL = 0.9  # of what is left, beside which a line's guess leaves what looks like anything
 _TURNED = -1.3  # change of a gain that is 1, below which it is its sign that is wrong
 
@@ -40,7 +41,7 @@ class Finding:
     term: of a function the one that it is most like, with a range to fit it in. of_input: whether
     a channel is an input. p_value: by chance,
     all tests counted. share: of the whitened residuals' squares that it explains. moves: the
-    farthest first.
+    farthest first. wider: how many times as wide the interval is that it widens most.
     """
 
     kind: Kind
@@ -52,6 +53,7 @@ class Finding:
     moves: tuple[Move, ...]
     term: AddedTerm | None = None
     of_input: bool = False
+    wider: float = 1.0
 
     @property
     def farthest(self) -> float:
@@ -60,8 +62,13 @@ class Finding:
 
     @property
     def counts(self) -> bool:
-        """Whether it moves a parameter noticeably, or is much of what is left."""
-        return self.farthest > MOVED or self.share > _LARGE
+        """Whether it moves a parameter noticeably, widens intervals, or is much of what is left."""
+        return self.farthest > MOVED or self.share > _LARGE or self.widens
+
+    @property
+    def widens(self) -> bool:
+        """Whether an interval without it is too narrow."""
+        return self.wider > _WIDER
 
     @property
     def comes_late(self) -> bool:

@@ -42,11 +42,16 @@ Kind = Literal[
 _PARTS = (0.5, 2.0)  # of a variant's further parameters
 _KNEE = 0.8  # share of a signal's peak from where its saturation is looked for
 _LEVELS = 3  # of a signal, below which it shows no function
-_JUMPING = 0.05  # mean square of a signal's steps in parts of its variance, from where it jumps
+# Mean square of a signal's steps in parts of its variance, from where it jumps: of what was
+# measured, and of a state, which the run follows between samples too, one of six samples a period.
+_JUMPING, _JUMPING_STATE = 0.05, 1.0
 # Delays that are tested [samples]: of a large one a small one tells little where inputs jump.
 _DELAYS = (0.1, -12.0, -4.0, 4.0, 12.0)
 _FILTERS = (1.0, 5.0)  # time constants of filters that are tested [samples]
 _PLAYS = (0.02, 0.1)  # parts of an input's peak
+# Deviations of chance by which two levels differ; samples that a signal stands at a level at least,
+# in the mean; and mean square of the slopes there in parts of chance.
+_STEP, _STANDS, _RISING = 4.5, 5, 2.0
 _RECORD = 0.1  # of a record, beyond which no delay is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _CLEAR = 3.0  # times the noise's power at a frequency, as chance makes in one of twenty
@@ -186,13 +191,14 @@ def _plays(
 def _noises(given: Input, runs: Sequence[DisturbedRun], i: int) -> Iterator[Suspect]:
     """White noise of an input of which none is known: what was logged and has not acted.
 
-    By so much of it as the input's own samples show, of which a Wiener filter tells what it was.
+    By so much of it as the input's own samples show, of which a Wiener filter tells what it was;
+    of an input that stands at levels what is beside them holds its slow part, too.
     """
     records = [run.record for run in runs]
     size = input_noise(records, i)
     if any(record.input_noise[i] for record in records) or not size:
         return
-    changes = _driven(runs, i, lambda run: likely_noise(run.record.inputs[:, i], size))
+    changes = _driven(runs, i, lambda run: _shown_noise(run.record.inputs[:, i], size))
     changes = -changes[..., None] / size
     yield Suspect("noise", given.name, given.unit, changes, of_input=True)
 
@@ -335,6 +341,47 @@ def _noise_power(n: int, deviation: float, colour: float) -> FloatArray:
     return power
 
 
+def _shown_noise(signal: FloatArray, deviation: float) -> FloatArray:
+    """What of a signal (n,) is likely to be the noise that its samples show."""
+    beside = _beside_levels(signal, deviation)
+    return likely_noise(signal, deviation) if beside is None else beside
+
+
+def _beside_levels(signal: FloatArray, deviation: float) -> FloatArray | None:
+    """A signal (n,) less the levels that it stands at; None where it stands at none.
+
+    Stretches are cut where their two parts' means differ by more than noise of this deviation
+    makes (Scott & Knott, "A cluster analysis method for grouping means", Biometrics 30, 1974). A
+    signal that is smooth goes on rising within them.
+    """
+    beside, slopes = signal.astype(np.float64), list[float]()
+    left = [slice(0, len(signal))]
+    while left and len(slopes) * _STANDS <= len(signal):
+        rows = left.pop()
+        cut = _cut(beside[rows], deviation)
+        if cut:
+            left += [slice(rows.start, rows.start + cut), slice(rows.start + cut, rows.stop)]
+            continue
+        beside[rows] -= beside[rows].mean()
+        along = np.arange(rows.stop - rows.start) - 0.5 * (rows.stop - rows.start - 1)
+        by_chance = deviation * max(float(np.linalg.norm(along)), 1.0)
+        slopes.append(float(along @ beside[rows]) / by_chance)
+    stands = not left and np.mean(np.square(slopes)) < _RISING
+    return beside if stands else None
+
+
+def _cut(stretch: FloatArray, deviation: float) -> int:
+    """Length of the first part of a stretch (n,) of two levels; 0 of one level."""
+    n = len(stretch)
+    if n < 2:
+        return 0
+    before = np.arange(1, n)
+    apart = np.cumsum(stretch - stretch.mean())[:-1]
+    sizes = np.abs(apart) / (deviation * np.sqrt(before * (n - before) / n))
+    cut = int(np.argmax(sizes))
+    return cut + 1 if sizes[cut] > _STEP else 0
+
+
 _Fault = tuple[Kind, Callable[[DisturbedRun], FloatArray]]
 
 
@@ -427,7 +474,8 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """Functions of every state and input, added to every equation that parameters act in.
 
     Inputs of two levels show no function, but an offset. Of signals that jump from sample to
-    sample, and are not held, the function between them is not known.
+    sample, and are not held, the function between them is not known; of states that swing in a few
+    samples nearly.
     """
     model = runs[0].model
     signals: list[State | Input] = [*model.states, *model.inputs]
@@ -435,7 +483,8 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         for j, signal in enumerate(signals):
             together = np.concatenate([_signal(run, j) for run in runs])
             held = isinstance(signal, Input) and signal.hold == "zoh"
-            if len(np.unique(together)) < _LEVELS or (_jumps(together) and not held):
+            limit = _JUMPING_STATE if isinstance(signal, State) else _JUMPING
+            if len(np.unique(together)) < _LEVELS or (_jumps(together, limit) and not held):
                 continue
             for terms in _terms(model.states[i].name, signal.name, together):
                 yield of_terms(runs, i, j, terms, held=held)
@@ -602,9 +651,9 @@ def _bent(
     return np.concatenate([run.added(part) for run, part in zip(runs, added, strict=True)])
 
 
-def _jumps(signal: FloatArray) -> bool:
+def _jumps(signal: FloatArray, limit: float) -> bool:
     """Whether a signal changes from sample to sample by much of all that it changes."""
-    return float(np.mean(np.diff(signal) ** 2)) > _JUMPING * float(np.var(signal))
+    return float(np.mean(np.diff(signal) ** 2)) > limit * float(np.var(signal))
 
 
 def _signal(run: DisturbedRun, j: int) -> FloatArray:

@@ -16,8 +16,10 @@ from sysid import (
     Parameter,
     ProcessModel,
     State,
+    examples,
 )
 from sysid.engine.simulation import BatchSimulator
+from sysid.judging.examination import verdict_of
 from tests.soak import mostly_soak
 from tests.sysid.support import INFEASIBLE, MOTOR, lag, motor, motor_record
 
@@ -345,3 +347,14 @@ def test_a_free_motion_has_no_inputs():
     assert found.parameters_["k"] == pytest.approx(frequency**2 + decay**2, rel=1e-6)
     assert found.n_features_in_ == 0
     np.testing.assert_allclose(found.predict(record)[:, 0], y, atol=1e-5)
+
+
+def test_a_fit_that_ends_where_nothing_can_be_simulated_has_no_intervals():
+    """With the steps that the end of a search takes a stiff model may grow beyond all bounds."""
+    record = examples.lag_record(seed=0)
+    fitted = GASSI(examples.lag(), population=20, generations=2).fit(record)
+    fitted.error_ = np.inf
+    with pytest.raises(ModelError, match="cannot be simulated where the fit ended"):
+        fitted.uncertainty(record)
+    reasons = verdict_of(fitted, [record], [examples.lag_record(seed=1)]).parameters.reasons
+    assert "The parameters have no intervals" in reasons[0]

@@ -506,6 +506,106 @@ def test_noise_of_a_held_input_is_no_play_of_it():
     assert not missing(lag(), log_of_means(0, windows, jitter=0.1, noise=0.02))
 
 
+GAIN_AND_LAG = ProcessModel(
+    name="gain and lag",
+    states=(State("y", "V"),),
+    inputs=(Input("u", "V"),),
+    outputs=(Output("y", "V"),),
+    parameters=(
+        Parameter("gain", "1", 2.0, 0.2, 20.0, "log"),
+        Parameter("tau", "s", 1.0, 0.05, 20.0, "log"),
+    ),
+    derivative=lambda x, u, p: ((p[0] * u[0] - x[0]) / p[1],),
+)
+
+
+def levels_log(seed, noise, is_known=False, n=600, pole=0.95):
+    """A lag under levels of twenty samples, logged with noise that has not acted."""
+    rng = np.random.default_rng(seed)
+    levels = np.repeat(rng.uniform(0.3, 1.8, n // 20), 20)
+    y = lfilter([0.0, 1.0 - pole], [1.0, -pole], levels) + 0.01 * rng.standard_normal(n)
+    logged = levels + noise * rng.standard_normal(n)
+    known = np.full(1, noise if is_known else 0.0)
+    return Dataset(logged, y, -np.log(pole), input_noise=known)
+
+
+def verdict_on_levels(*noise, seed):
+    records = [levels_log(s, *noise) for s in (seed, seed + 50)]
+    estimator = GASSI(GAIN_AND_LAG, population=60, generations=12).fit(records[0])
+    return verdict_of(estimator, records[:1], records[1:])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_noise_of_levels_that_makes_intervals_too_narrow_is_named(seed):
+    """What a slow plant makes of it is hidden below its sensor's noise, and sways estimates."""
+    verdict = verdict_on_levels(0.04, seed=seed)
+    assert verdict.predicted.trust == "good"
+    assert verdict.parameters.trust == "limited"
+    assert verdict.parameters.reasons[0].startswith("u is logged with noise of 0.04")
+    assert "times as wide" in verdict.parameters.reasons[0]
+
+
+def test_residuals_may_follow_an_only_input_whose_noise_is_known():
+    """Its noise stands in both, whatever the model; an input without it is tested."""
+    verdict = verdict_on_levels(0.1, True, seed=1)
+    assert verdict.trust == "good", verdict.reasons
+
+
+OSCILLATOR = ProcessModel(
+    name="oscillator",
+    states=(State("x", "m"), State("v", "m/s")),
+    inputs=(Input("force", "N"),),
+    outputs=(Output("x", "m"),),
+    parameters=(
+        Parameter("m", "kg", 2.0, 0.2, 20.0, "log"),
+        Parameter("c", "N*s/m", 5.0, 0.5, 50.0, "log"),
+        Parameter("k", "N/m", 4000.0, 250.0, 25000.0, "log"),
+    ),
+    derivative=lambda x, u, p: (x[1], (u[0] - p[1] * x[1] - p[2] * x[0]) / p[0]),
+)
+
+
+def oscillator_log(friction, seed, n=800, dt=0.01, parts=10):
+    """A kilogram that swings eight times a second under levels of force, by Runge and Kutta."""
+    rng = np.random.default_rng(seed)
+    force = np.repeat(rng.uniform(-20.0, 20.0, n // 5), 5)
+    x, h, positions = np.zeros(2), dt / parts, np.empty(n)
+
+    def rates(x, f):
+        return np.array([x[1], f - 4.0 * x[1] - 2500.0 * x[0] - friction(x[1])])
+
+    for k, f in enumerate(force):
+        positions[k] = x[0]
+        for _ in range(parts):
+            a = rates(x, f)
+            b = rates(x + 0.5 * h * a, f)
+            c = rates(x + 0.5 * h * b, f)
+            x = x + h / 6.0 * (a + 2.0 * b + 2.0 * c + rates(x + h * c, f))
+    return Dataset(force, positions + 1e-4 * rng.standard_normal(n), dt, name=f"log {seed}")
+
+
+@pytest.mark.parametrize(
+    ("friction", "words"),
+    mostly_soak(
+        [
+            (
+                lambda v: 3.0 * np.tanh(v / 2e-3),
+                "the sign of v in dv/dt, like dry friction",
+            ),
+            (lambda v: 6.0 * v * abs(v), "a term in v (square) in dv/dt"),
+            (lambda v: 0.0, ""),
+        ]
+    ),
+)
+def test_functions_of_a_state_that_swings_in_a_dozen_samples_are_named(friction, words):
+    """Known along the run, however fast: damping comes out twice as large without them."""
+    records = [oscillator_log(friction, seed) for seed in (0, 1)]
+    estimator = GASSI(OSCILLATOR, population=60, generations=12).fit(records[0])
+    verdict = verdict_of(estimator, records[:1], records[1:])
+    assert words in " ".join(verdict.parameters.reasons)
+    assert (verdict.parameters.trust == "limited") == bool(words), verdict.parameters.reasons
+
+
 TWO_MASSES = ProcessModel(
     name="two masses",
     states=(State("x1", "m"), State("v1", "m/s"), State("x2", "m"), State("v2", "m/s")),
