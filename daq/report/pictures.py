@@ -294,50 +294,70 @@ def _input_density(records: Sequence[Dataset], frequency: FloatArray) -> tuple[i
 
 
 def _frequency(subject: Subject) -> Iterator[Picture]:
-    try:
-        measured = frequency_response(subject.records)
-    except ModelError:
+    outputs, inputs = subject.model.outputs, subject.model.inputs
+    # Each by all of its samples: where another is not measured does not matter.
+    measured = {j: _response_of(subject.records, j) for j in range(len(outputs))}
+    estimates = {j: estimate for j, estimate in measured.items() if estimate is not None}
+    if not estimates:
         return  # too short, or of several sample rates: there is no estimate to show
-    inputs = subject.model.inputs
-    varied, pairs = np.flatnonzero(measured.varied), _pairs(measured)
-    unexplained = [
-        output.name for j, output in enumerate(subject.model.outputs) if j not in dict(pairs)
-    ]
+    finest = max(estimates.values(), key=lambda estimate: len(estimate.frequency))
+    causes = {j: _cause(estimate) for j, estimate in estimates.items()}
+    unexplained = [output.name for j, output in enumerate(outputs) if causes.get(j) is None]
     missing = (
         f" No frequency response of {', '.join(unexplained)} is drawn: an input explains it (with "
-        f"a coherence above {_COHERENT}) at fewer than {_FEWEST_COHERENT} of these frequencies."
+        f"a coherence above {_COHERENT}) at fewer than {_FEWEST_COHERENT} frequencies, or it has "
+        "too many gaps."
     ) * bool(unexplained)
-    n_segments, density = _input_density(subject.records, measured.frequency)
-    densities = {inputs[i].name: density[:, i] for i in varied}
+    n_segments, density = _input_density(subject.records, finest.frequency)
+    densities = {inputs[i].name: density[:, i] for i in np.flatnonzero(finest.varied)}
     yield Picture(
         "spectra", "excitation",
         "Spectra of the excitation: power spectral density of the inputs, Welch's estimate from "
         f"{n_segments} segments.{missing}",
-        spectra(measured.frequency, densities, {signal.name: signal.unit for signal in inputs}),
+        spectra(finest.frequency, densities, {signal.name: signal.unit for signal in inputs}),
     )  # fmt: skip
-    identified = _estimated_response(subject)
     band = np.union1d(
-        np.geomspace(measured.frequency[0], measured.frequency[-1], _FINE), measured.frequency
+        np.geomspace(finest.frequency[0], finest.frequency[-1], _FINE), finest.frequency
     )
     linear, lacking = _linear_responses(subject, band)
-    for j, i in pairs:
-        output, given = subject.model.outputs[j], inputs[i]
+    for j, i in causes.items():
+        if i is None:
+            continue
+        output, given, estimate = outputs[j], inputs[i], estimates[j]
+        identified, inside = _estimated_response(subject, j), band >= estimate.frequency[0]
         yield Picture(
             _stem("bode", output.name), "frequency",
             f"Frequency response from {given.name} to {output.name}, estimated from "
-            f"{measured.n_segments} segments of the logs.{lacking}",
+            f"{estimate.n_segments} segments of the logs.{lacking}",
             bode(
-                measured.frequency, measured.response[:, j, i], measured.coherence[:, j, i],
-                measured.deviation[:, j, i] / np.sqrt(2.0),
-                None if identified is None else identified[:, j, i],
-                band,
-                {name: response[:, j, i] for name, response in linear.items()},
+                estimate.frequency, estimate.response[:, 0, i], estimate.coherence[:, 0, i],
+                estimate.deviation[:, 0, i] / np.sqrt(2.0),
+                None if identified is None else identified.response[:, 0, i],
+                band[inside],
+                {name: response[inside, j, i] for name, response in linear.items()},
                 (output.unit, given.unit),
             ),
         )  # fmt: skip
 
 
-def _estimated_response(subject: Subject) -> ComplexArray | None:
+def _response_of(records: Sequence[Dataset], output: int) -> FrequencyResponse | None:
+    """Of one output to all inputs; None where that cannot be estimated."""
+    try:
+        return frequency_response(
+            [Dataset(record.inputs, record.outputs[:, output], record.dt) for record in records]
+        )
+    except ModelError:
+        return None
+
+
+def _cause(measured: FrequencyResponse) -> int | None:
+    """The input that is most coherent with an output, if any is coherent enough."""
+    n_coherent = np.sum(measured.coherence[:, 0] > _COHERENT, axis=0)
+    cause = int(np.argmax(n_coherent))
+    return cause if n_coherent[cause] >= _FEWEST_COHERENT else None
+
+
+def _estimated_response(subject: Subject, output: int) -> FrequencyResponse | None:
     """Of the identified model, from its free runs like the logs'; None where one diverges."""
     runs = [run for _, run in (*subject.training, *subject.validation)]
     if not all(np.isfinite(run).all() for run in runs):
@@ -346,7 +366,7 @@ def _estimated_response(subject: Subject) -> ComplexArray | None:
         replace(record, outputs=np.where(np.isfinite(record.outputs), run, np.nan))
         for record, run in zip(subject.records, runs, strict=True)
     ]
-    return frequency_response(simulated).response
+    return _response_of(simulated, output)
 
 
 def _linear_responses(
@@ -466,13 +486,6 @@ def _chosen(logs: Sequence[FreeRun]) -> list[tuple[int, str]]:
 def _stem(*words: str) -> str:
     """A file name made of words, with only characters that every file system takes."""
     return "-".join(re.sub(r"[^\w.]+", "-", word) for word in words if word)
-
-
-def _pairs(measured: FrequencyResponse) -> list[tuple[int, int]]:
-    """For each output the input most coherent with it, if any is coherent enough."""
-    n_coherent = np.sum(measured.coherence > _COHERENT, axis=0)
-    best = [(j, int(np.argmax(row))) for j, row in enumerate(n_coherent)]
-    return [(j, i) for j, i in best if n_coherent[j, i] >= _FEWEST_COHERENT]
 
 
 def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:

@@ -171,6 +171,41 @@ def test_every_figure_file_is_on_the_page(page, work):
     assert {i.removeprefix("figure-") for i in page.ids if i.startswith("figure-")} == files
 
 
+TWO_LAGS = """
+from sysid import Input, Output, Parameter, ProcessModel, State
+
+model = ProcessModel(
+    name="two lags",
+    states=(State("y", "m"), State("z", "m")),
+    inputs=(Input("u", "V"),),
+    outputs=(Output("y", "m"), Output("z", "m")),
+    parameters=(Parameter("tau", "s", 0.3, 0.05, 1.0, "log"),),
+    derivative=lambda x, u, p: ((2.0 * u[0] - x[0]) / p[0], (2.0 * u[0] - x[1]) / p[0]),
+)
+"""
+
+
+def test_gaps_of_an_output_do_not_take_away_the_frequency_response_of_another(tmp_path, rig):
+    (tmp_path / "lags.py").write_text(TWO_LAGS)
+    signals = ["u: {column: u}", "y: {column: y}", "z: {column: z}"]
+    (tmp_path / "id.yaml").write_text(
+        "model: lags.py:model\npopulation: 20\ngenerations: 3\ncolumns:\n"
+        f"  time: {{sample_rate: 50.0}}\n  inputs: {{{signals[0]}}}\n"
+        f"  outputs: {{{signals[1]}, {signals[2]}}}\n"
+    )
+    u, w, y = record(1).T
+    cells = ["" if k % 15 == 7 else repr(value) for k, value in enumerate((y + 0.01 * w).tolist())]
+    rows = [f"{a},{b},{c}" for a, b, c in zip(u.tolist(), y.tolist(), cells, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["u,y,z", *rows]) + "\n")
+    done = rig(
+        ["identify", "log.csv", "--config", "id.yaml", "--out", "found"], cwd=tmp_path, report=True
+    )
+    assert done.returncode == 0, done.stderr
+    drawn = {path.stem for path in (tmp_path / "found/figures").glob("bode-*.svg")}
+    assert drawn == {"bode-y"}
+    assert "No frequency response of z is drawn" in (tmp_path / "found/report.html").read_text()
+
+
 def test_text_from_users_is_text(page):
     assert "lag <i>&_%" in page.text
     assert "a lag & <script>alert(1)</script>" in page.text
