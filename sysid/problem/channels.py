@@ -13,6 +13,7 @@ from sysid.arrays import BoolArray, FloatArray
 
 _EQUAL = 1e-9  # of a channel's span: samples so close are the same
 _RESTING = 1e-3  # of its span: how near 0 a level is that of rest
+_FEWEST, _FEWEST_ALONE = 8, 3  # samples cut off; where values of a channel never come again
 _HARMLESS = 1e-4  # of a channel's variance
 _NEARBY = 8  # samples on either side, among which one stands out
 _SOME, _BRIEF = 4, 32  # samples of a burst
@@ -94,9 +95,13 @@ def _pile_up(values: FloatArray) -> PileUp | None:
     at = v >= top - _EQUAL * span
     count = int(at.sum())
     levels, counts = np.unique(v[~at], return_counts=True)
-    if count < max(8, 0.002 * len(v)) or len(levels) < 20 or abs(top) < _RESTING * span:
+    if len(levels) < 20 or abs(top) < _RESTING * span:
         return None
-    if count < 8.0 * counts[-5:].mean():
+    # Where no value between the ends ever comes again, chance does not make three of the largest.
+    between = v[~at & (v > float(v.min()) + _EQUAL * span)]
+    alone = len(np.unique(between)) == len(between)
+    often = max(_FEWEST, 0.002 * len(v), _FEWEST * float(counts[-5:].mean()))
+    if count < (_FEWEST_ALONE if alone else often):
         return None
     edges = np.flatnonzero(np.diff(at.astype(np.int8)))
     stretches = (len(edges) + int(at[0]) + int(at[-1])) // 2

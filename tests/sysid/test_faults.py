@@ -131,6 +131,14 @@ def test_clipping_on_one_side_gives_its_level():
     assert fault.share == pytest.approx(np.mean(record.outputs == 1.5))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_few_samples_that_are_cut_off_are_seen_where_no_value_comes_again(seed):
+    whole = driven(wave(), noise=0.05, seed=seed)
+    assert not data_faults(model(), [whole], [])
+    fault = one_fault([changed(whole, lambda y: np.minimum(y, np.sort(y, axis=0)[-4]))])
+    assert (fault.kind, fault.channel, fault.share) == ("clipped", "y", 4 / N)
+
+
 def test_a_measured_input_is_examined_like_an_output():
     record = driven(wave(), seed=1)
     measured = record.inputs + 0.01 * np.random.default_rng(2).standard_normal((N, 1))
