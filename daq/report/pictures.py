@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.signal import welch
 
 from daq.errors import ConfigError
 from daq.figures import style
@@ -276,23 +275,6 @@ def _correlations(names: Sequence[str], rows: Rows) -> FloatArray:
     return matrix
 
 
-def _input_density(records: Sequence[Dataset], frequency: FloatArray) -> tuple[int, FloatArray]:
-    """Segments, and power spectral density of each input at these frequencies [Hz], (n, n_inputs).
-
-    Of all samples, also where an output is not measured: a rare input may change just there.
-    """
-    n_segments, total = 0, np.zeros((len(frequency), records[0].inputs.shape[1]))
-    for record in records:
-        rate = 1.0 / record.dt
-        length = round(rate / frequency[0])
-        n = max((record.n_samples - length) // (length // 2) + 1, 0)
-        if n:
-            varying = record.inputs - record.inputs.mean(axis=0)
-            density = welch(varying, rate, nperseg=length, detrend=False, axis=0)[1]
-            n_segments, total = n_segments + n, total + n * density[1:-1]
-    return n_segments, total / n_segments
-
-
 def _frequency(subject: Subject) -> Iterator[Picture]:
     outputs, inputs = subject.model.outputs, subject.model.inputs
     # Each by all of its samples: where another is not measured does not matter.
@@ -308,13 +290,15 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         f"a coherence above {_COHERENT}) at fewer than {_FEWEST_COHERENT} frequencies, or it has "
         "too many gaps."
     ) * bool(unexplained)
-    n_segments, density = _input_density(subject.records, finest.frequency)
-    densities = {inputs[i].name: density[:, i] for i in np.flatnonzero(finest.varied)}
+    # Of all samples, also where no output is measured: a rare input may change just there.
+    of_all = frequency_response([Dataset(r.inputs, r.inputs, r.dt) for r in subject.records])
+    varied = np.flatnonzero(of_all.varied)
+    densities = {inputs[i].name: of_all.input_density[:, i] for i in varied}
     yield Picture(
         "spectra", "excitation",
         "Spectra of the excitation: power spectral density of the inputs, Welch's estimate from "
-        f"{n_segments} segments.{missing}",
-        spectra(finest.frequency, densities, {signal.name: signal.unit for signal in inputs}),
+        f"{of_all.n_segments} segments.{missing}",
+        spectra(of_all.frequency, densities, {signal.name: signal.unit for signal in inputs}),
     )  # fmt: skip
     band = np.union1d(
         np.geomspace(finest.frequency[0], finest.frequency[-1], _FINE), finest.frequency
