@@ -42,7 +42,6 @@ def next_commands(folder: Path) -> list[str]:
     A protocol that concludes something itself was not meant to excite everything.
     """
     from daq.logs.capture import LOG_NAME, read_record
-    from daq.lookup.rigs import DEFAULT_RIG
     from daq.recording.analysis import RESULTS
 
     results = folder / RESULTS
@@ -51,8 +50,8 @@ def next_commands(folder: Path) -> list[str]:
     ranges = results / "ranges.yaml"
     if not ranges.exists():
         return []
-    rig_file = (read_record(folder / LOG_NAME) or {}).get("rig_file") or DEFAULT_RIG
-    on_rig = options.rig_words(None if rig_file == DEFAULT_RIG else rig_file, None)
+    rig_file = (read_record(folder / LOG_NAME) or {}).get("rig_file")
+    on_rig = options.on_rig(rig_file) if rig_file else ""
     return [f"rig run prbs.yaml{on_rig} --identify --config {shlex.quote(str(ranges))}"]
 
 

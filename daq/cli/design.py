@@ -145,11 +145,8 @@ def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:
 
 
 def _show_next(result: DesignResult | DiscriminationResult) -> None:
-    from daq.lookup.rigs import DEFAULT_RIG
-
     print(f"Experiments, {result.figure.name} and design.json: {result.figure.parent}")
-    rig = None if result.rig_name == DEFAULT_RIG else result.rig_name
-    first = shlex.quote(str(result.runs[0].file)) + options.rig_words(rig, None)
+    first = shlex.quote(str(result.runs[0].file)) + options.on_rig(result.rig_name)
     terminal.print_next(f"rig check {first}", f"rig run {first}, and so each of them")
 
 

@@ -106,3 +106,14 @@ def rig_words(rig: str | None, port: str | None) -> str:
     """
     words = [("--rig", rig), ("--port", port)]
     return "".join(f" {name} {shlex.quote(value)}" for name, value in words if value is not None)
+
+
+def on_rig(rig_file: str) -> str:
+    """The same of a rig by its file, where commands do not take that one by themselves.
+
+    >>> on_rig("simulated.yaml"), on_rig("worn.yaml")
+    ('', ' --rig worn.yaml')
+    """
+    from daq.lookup.rigs import DEFAULT_RIG
+
+    return rig_words(None if rig_file == DEFAULT_RIG else rig_file, None)

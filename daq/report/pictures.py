@@ -304,11 +304,13 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         np.geomspace(finest.frequency[0], finest.frequency[-1], _FINE), finest.frequency
     )
     linear, lacking = _linear_responses(subject, band)
+    simulated = _simulated(subject)
     for j, i in causes.items():
         if i is None:
             continue
         output, given, estimate = outputs[j], inputs[i], estimates[j]
-        identified, inside = _estimated_response(subject, j), band >= estimate.frequency[0]
+        identified = _response_of(simulated, j) if simulated else None
+        inside = band >= estimate.frequency[0]
         yield Picture(
             _stem("bode", output.name), "frequency",
             f"Frequency response from {given.name} to {output.name}, estimated from "
@@ -341,16 +343,15 @@ def _cause(measured: FrequencyResponse) -> int | None:
     return cause if n_coherent[cause] >= _FEWEST_COHERENT else None
 
 
-def _estimated_response(subject: Subject, output: int) -> FrequencyResponse | None:
-    """Of the identified model, from its free runs like the logs'; None where one diverges."""
+def _simulated(subject: Subject) -> list[Dataset]:
+    """The logs with the identified model's free runs as outputs; none where one diverges."""
     runs = [run for _, run in (*subject.training, *subject.validation)]
     if not all(np.isfinite(run).all() for run in runs):
-        return None
-    simulated = [
+        return []
+    return [
         replace(record, outputs=np.where(np.isfinite(record.outputs), run, np.nan))
         for record, run in zip(subject.records, runs, strict=True)
     ]
-    return _response_of(simulated, output)
 
 
 def _linear_responses(

@@ -217,7 +217,7 @@ class RecordSimulator:
         driven, noisy = list(kernel.variation.driven), list(kernel.variation.noisy)
         process = np.broadcast_to(settings.process, len(model.states))
         intensity = process[driven] ** 2 / record.dt
-        of_inputs, colour = record.input_noise[noisy] ** 2, self._colour(settings)[noisy]
+        of_inputs, colour = record.input_noise[noisy] ** 2, self._colour(kernel, settings)
         start = np.zeros((kernel.n_states, LANES))
         start[: len(model.states)] = self._initial(starts, padded)
         kept = np.empty((*variances.shape, LANES))
@@ -261,8 +261,10 @@ class RecordSimulator:
         unit = settings.noise**2
         return unit, np.full(self._measured.shape, unit + settings.scatter)
 
-    def _colour(self, settings: FilterSettings) -> FloatArray:
-        return np.broadcast_to(settings.colour, len(self.record.input_noise))
+    def _colour(self, kernel: FilterKernel, settings: FilterSettings) -> FloatArray:
+        """Colour of the noisy inputs' noise."""
+        each: FloatArray = np.broadcast_to(settings.colour, len(self.record.input_noise))
+        return each[list(kernel.variation.noisy)]
 
     def filter_response(
         self,
@@ -286,7 +288,7 @@ class RecordSimulator:
         return filter_response(
             kernel, self.averaged, IntervalSlopes(intervals, after), before, mean,
             self._taken_in(kernel, settings)[1], variances, unit,
-            self._colour(settings)[list(kernel.variation.noisy)], settings.corrects,
+            self._colour(kernel, settings), settings.corrects,
         )  # fmt: skip
 
     def tangents(
