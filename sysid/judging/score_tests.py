@@ -218,7 +218,9 @@ class _Tests:
                 suspect, result, residual = self._closer(suspect, result, residual)
                 changes[surest] = suspect.changes / self._scales[..., None]
             term = self._term(suspect, changes[surest], residual)
-            self.findings.append(self._finding(suspect, result, logs[surest], term))
+            # Of what shape a function is hardly shows, and decides what it moves.
+            shapes = [results[i][0] for i in significant if suspects[i].shares_place(suspect)]
+            self.findings.append(self._finding(suspect, [result, *shapes], logs[surest], term))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -363,10 +365,12 @@ class _Tests:
         return _with_reach(term, size)
 
     def _finding(
-        self, suspect: Suspect, result: Regressed, log_p: float, term: AddedTerm | None
+        self, suspect: Suspect, results: Sequence[Regressed], log_p: float, term: AddedTerm | None
     ) -> Finding:
-        moved = self._gradients @ result.move[: self._gradients.shape[1]]
-        several, amplitudes = suspect.kind in _SEVERAL, result.amplitudes
+        """What a suspect's result finds, the first; moves by whichever result moves farthest."""
+        moves = [self._gradients @ each.move[: self._gradients.shape[1]] for each in results]
+        moved = np.array([max(each, key=abs) for each in zip(*moves, strict=True)])
+        several, amplitudes = suspect.kind in _SEVERAL, results[0].amplitudes
         names = [estimate.name for estimate in self._estimates]
         if suspect.kind == "change" and suspect.name in names:
             # Whatever its mean, it is not that value at either end of a record.
@@ -379,7 +383,7 @@ class _Tests:
             suspect.unit,
             None if several else float(amplitudes[0]),
             float(np.exp(min(log_p, 0.0))),
-            result.share,
+            results[0].share,
             moves_of(self._estimates, moved.tolist()),
             term,
             suspect.of_input,

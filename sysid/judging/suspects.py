@@ -97,6 +97,11 @@ class Suspect:
         rubs = any(term.shape == "stribeck" for term in self.terms)
         return rubs or self.kind in ("variant", "saturation", "filter", "lag", "play", "noise")
 
+    def shares_place(self, suspect: "Suspect") -> bool:
+        """Whether it is a function of the same signal in the same equation, of whatever shape."""
+        places = [{(term.equation, term.of) for term in each.terms} for each in (self, suspect)]
+        return self.kind == suspect.kind == "function" and places[0] == places[1]
+
     def same(self, suspect: "Suspect") -> bool:
         """Whether it is a delay of the same channel, of another size."""
         return self.late is not None and (self.kind, self.name) == (suspect.kind, suspect.name)

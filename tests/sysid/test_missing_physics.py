@@ -426,6 +426,19 @@ def test_what_fits_no_function_is_not_good(name):
 
 
 @pytest.mark.soak
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("Stribeck friction, much noise", 0), ("Stribeck friction, load's noise", 15)],
+)
+def test_a_function_whose_shape_is_not_sure_moves_as_any_likely_shape_does(name, seed):
+    """Near standstill alone friction leaves the damping as it is, of dry friction it takes half."""
+    outcome = tried(CASES[name], seed)
+    assert outcome.moved == ("B",)
+    assert outcome.verdict.parameters.trust == "limited"
+    assert " omega" in outcome.verdict.parameters.reasons[0]
+
+
+@pytest.mark.soak
 def test_an_end_that_the_data_do_not_push_at_hides_nothing():
     """Friction takes the damping's place: below its low end the damping would change little."""
     (training,), _ = CASES["Stribeck friction"].records(0)
