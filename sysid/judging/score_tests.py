@@ -13,6 +13,7 @@ parameter, a channel's zero by as much as its calibration left open. The suspect
 probability is taken into the regression, and the rest asked again.
 """
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
@@ -391,11 +392,12 @@ class _Tests:
 
 
 def _of_phase(sine: AddedTerm, amplitudes: FloatArray) -> AddedTerm:
-    """The sine that one and a cosine of these amplitudes make together."""
-    phase = float(np.arctan2(amplitudes[1], amplitudes[0]))
+    """The sine that one and a cosine of these amplitudes make together, those of a first record."""
+    along, across = amplitudes[:2].tolist()
+    phase = math.atan2(across, along)
     centre = sine.centre - phase * sine.scale
     term = replace(sine, scale=float(f"{sine.scale:.4g}"), centre=float(f"{centre:.3g}"))
-    return _with_reach(term, float(np.hypot(*amplitudes)))
+    return _with_reach(term, math.hypot(along, across))
 
 
 def _with_reach(term: AddedTerm, size: float) -> AddedTerm:

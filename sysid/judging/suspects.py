@@ -98,9 +98,15 @@ class Suspect:
         return rubs or self.kind in ("variant", "saturation", "filter", "lag", "play", "noise")
 
     def shares_place(self, suspect: "Suspect") -> bool:
-        """Whether it is a function of the same signal in the same equation, of whatever shape."""
-        places = [{(term.equation, term.of) for term in each.terms} for each in (self, suspect)]
-        return self.kind == suspect.kind == "function" and places[0] == places[1]
+        """Whether it is a function of the same signal in the same equation, of whatever shape.
+
+        Sines of other periods are no other shapes of one that repeats.
+        """
+        if not self.terms or not suspect.terms:
+            return False
+        terms = (*self.terms, *suspect.terms)
+        repeats = any(term.shape == "sine" for term in terms)
+        return len({(term.equation, term.of) for term in terms}) == 1 and not repeats
 
     def same(self, suspect: "Suspect") -> bool:
         """Whether it is a delay of the same channel, of another size."""
@@ -486,32 +492,34 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     signals: list[State | Input] = [*model.states, *model.inputs]
     for i in physical_equations(runs[0]):
         for j, signal in enumerate(signals):
-            together = np.concatenate([_signal(run, j) for run in runs])
+            together = np.concatenate([_signal(j, run) for run in runs])
             held = isinstance(signal, Input) and signal.hold == "zoh"
             limit = _JUMPING_STATE if isinstance(signal, State) else _JUMPING
             if len(np.unique(together)) < _LEVELS or (_jumps(together, limit) and not held):
                 continue
             for terms in _terms(model.states[i].name, signal.name, together):
-                yield of_terms(runs, i, j, terms, held=held)
+                yield of_terms(runs, i, partial(_signal, j), terms, held=held)
 
 
 def of_terms(
     runs: Sequence[DisturbedRun],
     i: int,
-    j: int,
+    signal: Callable[[DisturbedRun], FloatArray],
     terms: tuple[AddedTerm, ...],
     *,
     held: bool = False,
 ) -> Suspect:
-    """Functions of signal j, counted through states and inputs, in equation i together."""
+    """Functions of a signal (n_samples,) of each run, in equation i together."""
     state = runs[0].model.states[i]
-    columns = [_added(runs, i, partial(_term_along, term, j, held)) for term in terms]
+    columns = [_added(runs, i, partial(_term_along, term, signal, held)) for term in terms]
     return Suspect("function", state.name, f"{state.unit}/s", np.stack(columns, axis=2), terms)
 
 
-def _term_along(term: AddedTerm, j: int, held: bool, run: DisturbedRun) -> FloatArray:
+def _term_along(
+    term: AddedTerm, signal: Callable[[DisturbedRun], FloatArray], held: bool, run: DisturbedRun
+) -> FloatArray:
     """Values (n_samples,) whose straight lines are in the mean what a held signal's steps are."""
-    values = _values(term, _signal(run, j))
+    values = _values(term, signal(run))
     return 0.5 * (values + np.append(values[:1], values[:-1])) if held else values
 
 
@@ -661,7 +669,8 @@ def _jumps(signal: FloatArray, limit: float) -> bool:
     return float(np.mean(np.diff(signal) ** 2)) > limit * float(np.var(signal))
 
 
-def _signal(run: DisturbedRun, j: int) -> FloatArray:
+def _signal(j: int, run: DisturbedRun) -> FloatArray:
+    """Signal j, counted through states and inputs."""
     n = run.states.shape[1]
     return run.states[:, j] if j < n else run.record.inputs[:, j - n]
 
