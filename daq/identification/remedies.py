@@ -14,8 +14,10 @@ from sysid.problem.faults import DataFault
 
 if TYPE_CHECKING:
     from sysid.judging.findings import Finding
+    from sysid.judging.starts import Start
 
 _WIDER = 10.0  # by which factor a range is widened
+_WIDER_START = 2.0  # ranges by which one of a start is widened on either side
 _ALIKE = 0.02  # by which a gain may differ from that between two units
 _ANGLES = ("rpm", "deg/s", "turn/s", "rad/s", "deg", "turn", "rad")
 _PREFIXES = ("m", "k")
@@ -29,11 +31,12 @@ def remedies(
     faults: Sequence[DataFault] = (),
     findings: Sequence[Finding] = (),
     pushed: Mapping[str, tuple[float, float, float]] | None = None,
+    starts: Sequence[Start] = (),
 ) -> tuple[str, ...]:
     """``KEY=VALUE`` for each thing found that a setting mends, empty for none.
 
     channels: units of the model's inputs and outputs by name. pushed: value and range, searched on
-    a logarithm, of what the data want beyond it.
+    a logarithm, of what the data want beyond it. starts: initial states that were estimated.
 
     >>> from sysid.problem.faults import DataFault
     >>> late = DataFault("lag", "doubt", "training", ("log",), "y", "", "", "", 1.0,
@@ -43,7 +46,8 @@ def remedies(
     """
     doubts = [fault for fault in faults if fault.severity == "doubt"]
     of_faults = [setting for fault in doubts for setting in fault.settings]
-    changes: dict[str, str] = dict(setting.split("=", 1) for setting in of_faults)
+    changes: dict[str, str] = dict(_of_starts(starts))
+    changes |= dict(setting.split("=", 1) for setting in of_faults)
     # A lag is what delays that were found are as well, and noise of an input may look like one.
     late = any(fault.kind == "lag" for fault in faults) or any(f.kind == "noise" for f in findings)
     units = channels or {}
@@ -56,6 +60,16 @@ def remedies(
     if not changes and not spoiled:  # what is wrong with the data drives parameters to the ends
         changes |= dict(_of_ranges(pushed or {}))
     return tuple(f"{key}={value}" for key, value in changes.items())
+
+
+def _of_starts(starts: Sequence[Start]) -> Iterator[tuple[str, str]]:
+    """Wider ranges of starts that stand on an end; an end at 0 is what physics allows."""
+    for name in dict.fromkeys(start.state for start in starts if start.on_end):
+        ranges = [(start.low, start.high) for start in starts if start.state == name]
+        low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+        more = _WIDER_START * (high - low)
+        ends = (low - more if low else 0.0, high + more if high else 0.0)
+        yield f"initial.{name}", f"[{ends[0]:.3g}, {ends[1]:.3g}]"
 
 
 def _of_channels(

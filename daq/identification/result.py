@@ -195,6 +195,12 @@ class Identification(Shown):
             faults=self.faults,
             findings=() if self.suspicion is None else self.suspicion.findings,
             pushed=self._pushed,
+            starts=[
+                start
+                for log in (*self.training, *self.validation)
+                if log.result.starts is not None
+                for start in log.result.starts.estimates
+            ],
         )
         if not settings:
             return None

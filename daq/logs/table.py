@@ -290,7 +290,8 @@ def _layout_with(path: Path, columns: Sequence[str]) -> Layout:
     layout = layout_of(_complete_lines(path, _HEAD)[0])
     line, header = layout.line, layout.names
     if all(_is_number(name) for name in header):
-        cure = "it must hold the column names"
+        example = ",".join(f"column{i + 1}" for i in range(len(header)))
+        cure = f"it must hold the column names: write a line such as '{example}' above it"
         raise ConfigError("the first line holds numbers", cure=cure, file=path, line=line)
     names = [name for name in header if name]
     repeated = sorted({name for name in names if header.count(name) > 1})

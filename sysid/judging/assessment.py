@@ -181,7 +181,8 @@ def judge(
     predicted = _prediction(model, training, validation, broken, faults)
     judged = validation or training
     doubts = [fault for fault in faults if fault.severity == "doubt"]
-    light = [fault.sentence for fault in doubts if not _voids_only(fault)]
+    spoilt = [fault for fault in doubts if not fault.voids_validation]
+    light = [fault.sentence for fault in spoilt if fault.part == "training"]
     if alternative is not None and alternative.better:
         light.append(_lacking(alternative))
     missing = [f for f in findings or () if f.kind != "variant"]
@@ -193,8 +194,11 @@ def judge(
     counting = [f for f in missing if f.counts]
     if not counting and _moved_together(missing) > MOVED:
         counting = missing
-    in_vain = alternative.terms if alternative is not None and not alternative.better else ()
-    light += [_in_vain(f) if f.term in in_vain else _moving(f) for f in counting]
+    in_vain = None if alternative is None or alternative.better else alternative
+    light += [
+        _moving(f) if in_vain is None or f.term not in in_vain.terms else _in_vain(f, in_vain)
+        for f in counting
+    ]
     if predicted.trust != "poor":  # which is more than these can say
         if not light:
             light += _unexplained(model, judged)
@@ -213,6 +217,7 @@ def judge(
     slight = "; ".join(description(f) for f in missing if f not in counting)
     moving = f"Found, but moving no parameter by {MOVED:g} standard deviations: {slight}."
     notes = [moving] if slight else []
+    notes += [fault.sentence for fault in spoilt if fault.part == "validation"]
     return Verdict(predicted, parameters, (*notes, *_untested(model, judged, uncertainty)))
 
 
@@ -270,11 +275,6 @@ def _moved_together(findings: Sequence[Finding]) -> float:
     for move in (move for finding in findings for move in finding.moves):
         totals[move.quantity.name] = totals.get(move.quantity.name, 0.0) + move.deviations
     return max(map(abs, totals.values()), default=0.0)
-
-
-def _voids_only(fault: DataFault) -> bool:
-    """Whether a fault makes a validation none, and does nothing else."""
-    return fault.voids_validation and not fault.moves_parameters
 
 
 def _failed_runs(model: ProcessModel, results: Sequence[RecordResult]) -> Iterator[str]:
@@ -557,11 +557,18 @@ def _moving(finding: Finding) -> str:
     return f"{says}{text} ({chance})" + (f"; {effect}." if not finding.turned_round else ".")
 
 
-def _in_vain(finding: Finding) -> str:
+def _in_vain(finding: Finding, fitted: Alternative) -> str:
     """Reason: a function by which something shows that it is not, as its fit says."""
+    worse = ", ".join(
+        f"{name} {old:.0f} -> {new:.0f} %"
+        for name, (old, new) in fitted.fits.items()
+        if old - new >= 1.0
+    )
+    validated = fitted.comparison.validated and worse
+    explains = f"validation worse ({worse})" if validated else "the data no better"
     return (
         f"What is left looks like {description(finding)} ({_chance(finding)}), but fitted with it "
-        "the model explains the data no better: something else is missing, and parameters may be "
+        f"the model explains {explains}: something else is missing, and parameters may be "
         "off by more than their intervals."
     )
 

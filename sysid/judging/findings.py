@@ -99,8 +99,7 @@ _WORDS = {
 }
 # What has no single amplitude.
 _SHAPES = {
-    "bend": "another {name} where what it multiplies is small than where it is large, as of a "
-    "spring that hardens or has play",
+    "bend": "a {name} that changes with the size of what it multiplies",
     "curve": "a curve between {name} and what is logged of it, as of a sensor that bends",
     "disturbance": "a slow signal in d{name}/dt that nobody measured",
 }
@@ -148,4 +147,5 @@ def _term_text(term: AddedTerm) -> str:
     if term.shape == "sine":
         period = f"{2.0 * math.pi * term.scale:.3g}"
         return f"a term in {equation} that repeats with {term.of} (every {period}), like cogging"
-    return f"a term in {term.of} ({term.shape}) in {equation}"
+    about = f" about {term.centre:g}" if term.centre else ""
+    return f"a term in {term.of} ({term.shape}{about}) in {equation}"

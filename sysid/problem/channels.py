@@ -17,6 +17,9 @@ _FEWEST, _FEWEST_ALONE = 8, 3  # samples cut off; where values of a channel neve
 _HARMLESS = 1e-4  # of a channel's variance
 _NEARBY = 8  # samples on either side, among which one stands out
 _SOME, _BRIEF = 4, 32  # samples of a burst
+# Share of samples that repeat the one before, below which noise of 0.4 steps and more, or motion,
+# carries a channel across its steps: what rounding adds is a hundredth of a step in the mean then.
+_HELD = 0.6
 _SHORT, _LONGER = 1.0, 2.0  # samples, and times a mean's own, of means that foretell it
 MEDIAN_OF_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
 
@@ -303,10 +306,13 @@ def standstill(values: FloatArray, inputs: FloatArray) -> Standstill | None:
 def coarse_steps(values: FloatArray) -> Steps | None:
     """The resolution of a measured channel that mostly repeats its last value.
 
-    Only where it moves over fewer than 64 steps, all alike: finer ones do no harm.
+    Only where it moves over fewer than 64 steps, all alike: finer ones do no harm. Nor do steps
+    that noise moves the channel across at nearly every other sample: rounding averages out then.
 
     >>> coarse_steps(np.round(8.0 * np.sin(0.02 * np.arange(1000)))).levels
     17
+    >>> noise = 0.5 * np.random.default_rng(0).standard_normal(1000)
+    >>> coarse_steps(np.round(8.0 * np.sin(0.02 * np.arange(1000)) + noise))
     """
     v = values[np.isfinite(values)]
     levels = np.unique(v)
@@ -317,6 +323,6 @@ def coarse_steps(values: FloatArray) -> Steps | None:
     jumps = counts[counts > 0.5]
     even = np.abs(np.diff(levels) / step - np.round(np.diff(levels) / step)).max() < 0.05
     held = 1.0 - len(jumps) / max(len(counts), 1)
-    if not even or held < 0.4 or len(v) < 3 * len(levels):
+    if not even or held < _HELD or len(v) < 3 * len(levels):
         return None
     return Steps(step, len(levels))

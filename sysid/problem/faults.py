@@ -38,6 +38,7 @@ _LONG = 10  # samples lost in a row that are many
 _STRAIGHT = 1e-9  # of an input, by which rounding bends a straight line
 _ENOUGH = 0.3  # of a record, that is worth to be fitted by itself
 _GROSS = 5.0  # of a command's deviation, beyond which a single value is no command
+_IN_VALIDATION = "no parameter comes of it, but errors in validation do"
 _LEFT_OUT = "as 'robust: true' has it, these samples count as not measured"
 _COARSE = 16  # steps in a channel's span, below which they are seen in the parameters
 
@@ -308,6 +309,8 @@ class _Channel:
         share: float,
     ) -> DataFault:
         where = self.part, (self.record.name,), self.name
+        if severity == "doubt" and self.part == "validation":
+            effect = _IN_VALIDATION
         moves = severity == "doubt" and self.part == "training"
         settings = ("robust=true",) if "'robust: true'" in cure else ()
         return DataFault(

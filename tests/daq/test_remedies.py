@@ -14,6 +14,7 @@ from daq.identification.remedies import remedies
 from daq.lookup.models import find_model
 from sysid import BatchSimulator, Dataset
 from sysid.judging.findings import Finding
+from sysid.judging.starts import Start
 from sysid.problem.faults import DataFault
 from tests.daq.support import slide_log, slide_model
 
@@ -39,13 +40,14 @@ def fault(kind, severity="doubt", settings=()):
     return DataFault(kind, severity, "training", ("log",), "y", "", "", "", 0.1, settings=settings)
 
 
-def mended(findings=(), faults=(), pushed=None, **content):
+def mended(findings=(), faults=(), pushed=None, starts=(), **content):
     return remedies(
         settings(**content),
         {"u": "V", "y": "rad/s"},
         faults=faults,
         findings=findings,
         pushed=pushed,
+        starts=starts,
     )
 
 
@@ -53,6 +55,21 @@ def test_a_delay_is_added_to_what_is_taken_out_already():
     assert mended([found("delay", "y", 0.00412)]) == ("delay.y=0.00412",)
     late = [found("delay", "u", -0.002)]
     assert mended(late, delay={"u": "5 ms"}) == ("delay.u=0.003",)
+
+
+def test_starts_on_an_end_are_searched_farther():
+    """As of a swinging pendulum, whose held-back part begins in motion."""
+    begun = [
+        Start("angle", "rad", 0.3, 0.31, -0.5, 0.5),
+        Start("speed", "rad/s", 0.1, np.nan, -2.0, 2.0),
+        Start("speed", "rad/s", 2.0, np.nan, -2.0, 2.0),
+        Start("level", "m", 0.2, np.nan, 0.0, 0.2),
+    ]
+    changed = ("initial.speed=[-10, 10]", "initial.level=[0, 0.6]")
+    assert mended(starts=begun) == changed
+    # What the first samples say is said more closely.
+    known = fault("start", settings=("initial.level=[0, 0.4]",))
+    assert mended(faults=[known], starts=begun) == (changed[0], "initial.level=[0, 0.4]")
 
 
 def test_a_sign_is_turned_round_where_the_file_says_it():

@@ -269,11 +269,11 @@ def test_what_the_parameters_own_uncertainty_leaves_of_an_input_is_not_missing_d
 
 
 def test_faults_of_the_data_count_where_they_matter():
-    def with_fault(severity="doubt", **kind):
+    def with_fault(severity="doubt", part="training", **kind):
         fault = DataFault(
             "clipped",
             severity,
-            "training",
+            part,
             ("log",),
             "speed",
             "Clipped",
@@ -289,6 +289,9 @@ def test_faults_of_the_data_count_where_they_matter():
     (reason,) = moved.parameters.reasons
     assert moved.predicted.trust == "good" and reason.startswith("log: Clipped")
     assert (void.predicted.reasons, void.parameters.trust) == ((reason,), "good")
+    # No parameter comes of what was held back.
+    apart = with_fault(part="validation")
+    assert apart.trust == "good" and apart.notes[0] == reason
 
 
 def finding(kind, deviations, name="speed"):
@@ -341,6 +344,15 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
         "1e-06), but fitted with it the model explains the data no better: something else is "
         "missing, and parameters may be off by more than their intervals.",
     )
+    # What training has better and validation worse is no term of the plant's either.
+    validated = replace(
+        added,
+        better=False,
+        fits={"speed": (74.0, 32.0)},
+        comparison=replace(comparison, validated=True),
+    )
+    worse = found([replace(finding("function", 3.0), term=term)], validated)
+    assert "the model explains validation worse (speed 74 -> 32 %): " in worse.parameters.reasons[0]
     others = [finding("function", 3.0), finding("offset", 2.0)]
     reasons = found(others, added).parameters.reasons
     assert [reason.partition(";")[0] for reason in reasons] == [

@@ -147,6 +147,23 @@ def test_a_measured_input_is_examined_like_an_output():
     assert (fault.kind, fault.channel, fault.severity) == ("clipped", "u", "doubt")
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.5])
+def test_steps_are_coarse_where_no_noise_carries_the_channel_across_them(noise):
+    """A tacho that counts 16 steps: with half a step of noise their mean errs by 1/400 of one."""
+    step = 2.0 / 16
+    record = driven(0.5 * np.sign(levels()), noise=noise * step, tau=0.2)
+    rounded = changed(record, lambda y: step * np.round(y / step))
+    kinds = [fault.kind for fault in data_faults(model(), [rounded])]
+    assert kinds == (["coarse"] if noise < 0.4 else [])
+
+
+def test_a_fault_of_the_validation_moves_no_parameter():
+    record = driven(levels(1), seed=1)
+    fault = one_fault([driven(levels())], [changed(record, FAULTS["clipped"])])
+    assert (fault.kind, fault.part, fault.severity) == ("clipped", "validation", "doubt")
+    assert not fault.moves_parameters and "no parameter" in fault.effect
+
+
 def test_a_limited_command_is_left_to_the_user():
     fault = one_fault([driven(np.clip(wave(), -0.8, 0.8))])
     assert (fault.kind, fault.channel, fault.severity) == ("clipped", "u", "note")
