@@ -300,7 +300,7 @@ def _complaint(kind: str, item: ErrorDetails, value: object, types: Sequence[Any
     expected = _EXPECTED.get(kind) or _expected_values(kind, context, types)
     if expected:
         problem = f"{expected.format(**context)}, found {_shown(value)}"
-        return problem, _cure_of_value(kind, value, context)
+        return problem, _cure_of_value(kind, value, context, types)
     message = item["msg"].removeprefix("Value error, ")
     shown = "" if isinstance(value, Mapping) else f"; found {_shown(value)}"
     return message[0].lower() + message[1:] + shown, ""
@@ -321,7 +321,9 @@ def _expected_values(kind: str, context: Mapping[str, Any], types: Sequence[Any]
     return ""
 
 
-def _cure_of_value(kind: str, value: object, context: Mapping[str, Any]) -> str:
+def _cure_of_value(
+    kind: str, value: object, context: Mapping[str, Any], types: Sequence[Any]
+) -> str:
     """What to write instead, where that is plain from the value."""
     if _EXPECTED.get(kind) in {_NUMBER, _WHOLE}:
         if re.match(r"[-+]?\d+,\d", str(value)):
@@ -329,7 +331,11 @@ def _cure_of_value(kind: str, value: object, context: Mapping[str, Any]) -> str:
         has_unit = re.match(r"[-+]?[\d.]+\s*[^\W\d]", str(value))
         return "this one takes no unit" if has_unit else ""
     if _EXPECTED.get(kind) == _LINES:
-        return _NO_SECTION.get(type(value).__name__, "")
+        is_name = isinstance(value, str) and any(
+            "column" in getattr(each, "model_fields", ()) for each in types
+        )
+        no_section = _NO_SECTION.get(type(value).__name__, "")
+        return f"write {{column: {value}}}" if is_name else no_section
     if kind == "list_type" and isinstance(value, str | int | float):
         return f"write [{value}]"
     if kind == "string_type" and isinstance(value, int | float):

@@ -562,13 +562,16 @@ def _in_vain(finding: Finding, fitted: Alternative) -> str:
     worse = ", ".join(
         f"{name} {old:.0f} -> {new:.0f} %"
         for name, (old, new) in fitted.fits.items()
-        if old - new >= 1.0
+        if not old - new < 1.0
     )
-    validated = fitted.comparison.validated and worse
-    explains = f"validation worse ({worse})" if validated else "the data no better"
+    explains = "explains the data no better"
+    if fitted.comparison.validated and worse:
+        explains = f"explains validation worse ({worse})"
+        if not all(math.isfinite(new) for _, new in fitted.fits.values()):
+            explains = "cannot be simulated on validation, where it grows beyond all bounds"
     return (
         f"What is left looks like {description(finding)} ({_chance(finding)}), but fitted with it "
-        f"the model explains {explains}: something else is missing, and parameters may be "
+        f"the model {explains}: something else is missing, and parameters may be "
         "off by more than their intervals."
     )
 

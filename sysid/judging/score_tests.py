@@ -28,7 +28,7 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.judging.background import Background, of_filter, of_free_runs
 from sysid.judging.cycles import cycle_suspects
-from sysid.judging.findings import Finding, moves_of
+from sysid.judging.findings import Finding, Move, moves_of
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
     Suspect,
@@ -62,6 +62,8 @@ _AS_MUCH = 0.95  # of what another explains, that counts as the same
 _LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
 _FEW = 25  # samples for each amplitude, below which what they leave tells no colour
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
+# Change from first to last of what is nowhere below zero, in parts of its mean: 2, 1 for chance.
+_EMPTIED = 3.0
 _REACH = 10.0  # of a term's range in parts of the size that its test found
 # Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
 # its value, the data want it elsewhere, and nobody knows where.
@@ -197,7 +199,8 @@ class _Tests:
         while left and len(self.findings) < _MOST:
             results = self._tested(changes, suspects, left)
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
-            significant = [i for i in logs if logs[i] < _LOG_CHANCE]
+            likely = [i for i in logs if logs[i] < _LOG_CHANCE]
+            significant = [i for i in likely if self._is_possible(suspects[i], results[i][0])]
             if not significant:
                 return
             # Of probabilities too small for a number what explains more decides.
@@ -229,6 +232,17 @@ class _Tests:
             self._ends.append(len(self._free))
             self._regression = self._coloured_by(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
+
+    def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
+        """Whether a parameter that changes stays above zero where physics asks for that."""
+        limits = self._limits.get(suspect.name) if suspect.kind == "change" else None
+        return limits is None or limits[0] < 0.0 or abs(result.amplitudes[0]) < _EMPTIED
+
+    @cached_property
+    def _limits(self) -> dict[str, tuple[float, float]]:
+        """What physics allows of each parameter, by name."""
+        parameters = self._local.objective.space.parameters
+        return {p.name: (p.minimum, p.maximum) for p in parameters}
 
     def _asked(self, suspects: Sequence[Suspect]) -> tuple[list[FloatArray], list[int], int]:
         """Changes by each suspect, those that change anything, and how many tests these are."""
@@ -378,6 +392,8 @@ class _Tests:
             place = names.index(suspect.name)
             half = 0.5 * float(amplitudes[0]) * self._estimates[place].value
             moved[place] = max(moved[place], half, key=abs)
+        # A line may lead farther than physics allows.
+        moves_to = [self._within_limits(move) for move in moves_of(self._estimates, moved.tolist())]
         return Finding(
             suspect.kind,
             suspect.name,
@@ -385,10 +401,15 @@ class _Tests:
             None if several else float(amplitudes[0]),
             float(np.exp(min(log_p, 0.0))),
             results[0].share,
-            moves_of(self._estimates, moved.tolist()),
+            tuple(moves_to),
             term,
             suspect.of_input,
         )
+
+    def _within_limits(self, move: Move) -> Move:
+        low, high = self._limits.get(move.quantity.name, (-np.inf, np.inf))
+        value = move.quantity.value
+        return replace(move, change=float(np.clip(move.change, low - value, high - value)))
 
 
 def _of_phase(sine: AddedTerm, amplitudes: FloatArray) -> AddedTerm:

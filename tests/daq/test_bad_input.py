@@ -269,6 +269,10 @@ CASES = [
     # --- identification
     settings("misspelt setting", "populaton: 20\n",
              "id.yaml:1:1: populaton: unknown key; did you mean 'population'?"),
+    settings("columns by their names alone",
+             "columns:\n  time: t\n  outputs: {omega: speed}\n",
+             "id.yaml:2:3: columns.time: expected 'key: value' lines, found 't'; write {column: t}",
+             "id.yaml:3:13: columns.outputs.omega: expected 'key: value' lines, found 'speed'"),
     settings("a range the wrong way round", IDENTIFICATION.replace("[0.1, 0.2]", "[0.2, 0.1]"),
              "id.yaml:4:3: ranges.K_m: low end 0.2 is not below high end 0.1; write [low, high]"),
     settings("a range in a unit of another kind",

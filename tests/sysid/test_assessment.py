@@ -353,6 +353,11 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     )
     worse = found([replace(finding("function", 3.0), term=term)], validated)
     assert "the model explains validation worse (speed 74 -> 32 %): " in worse.parameters.reasons[0]
+    wild = found(
+        [replace(finding("function", 3.0), term=term)],
+        replace(validated, fits={"speed": (74.0, -np.inf)}),
+    )
+    assert "the model cannot be simulated on validation, " in wild.parameters.reasons[0]
     others = [finding("function", 3.0), finding("offset", 2.0)]
     reasons = found(others, added).parameters.reasons
     assert [reason.partition(";")[0] for reason in reasons] == [

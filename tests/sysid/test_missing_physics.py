@@ -29,7 +29,7 @@ from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessMode
 from sysid.examples import lag
 from sysid.gassi import GASSI
 from sysid.judging.disturbed import DisturbedRun
-from sysid.judging.examination import suspected, verdict_of
+from sysid.judging.examination import score_tests_of, suspected, verdict_of
 from sysid.judging.suspects import channel_suspects
 from sysid.judging.whitener import colour_about_line
 from sysid.threads import Workers
@@ -737,3 +737,49 @@ def doses(seed, n=60, dt=0.5):
 def test_a_short_log_of_a_right_model_asks_for_nothing(seed):
     """Four waves fit much of sixty samples, and leave a colour that makes them sure."""
     assert not [f for f in missing(DOSES, doses(seed)) if f.counts]
+
+
+def opened(pwm, hold=1.0, dt=0.02, seed=1):
+    """Speed of a geared motor whose driver opens between pulses: no first order with friction."""
+    rng, speed, speeds = np.random.default_rng(seed), 0.0, []
+    duties = np.repeat(pwm, round(hold / dt)) / 255.0
+    for duty in duties:
+        speeds.append(speed)
+        for _ in range(20):
+            push = 9050.0 * duty - (5.3 * duty + 1.3) * speed
+            rubs = speed > 0.0 or push > 1420.0
+            speed = max(speed + dt / 20 * (push - 1420.0), 0.0) if rubs else 0.0
+    noisy = np.array(speeds) + 30.0 * rng.standard_normal(len(speeds))
+    return Dataset(255.0 * duties, noisy, dt, "staircase")
+
+
+FIRST_ORDER = ProcessModel(
+    name="first_order",
+    states=(State("speed", "rpm"),),
+    inputs=(Input("pwm", "1", "zoh"),),
+    outputs=(Output("speed", "rpm"),),
+    parameters=(
+        Parameter("gain", "rpm", 4.0, 0.4, 40.0, "log"),
+        Parameter("tau", "s", 0.2, 0.01, 3.0, "log"),
+        Parameter("friction", "rpm", 50.0, 0.0, 400.0),
+    ),
+    derivative=lambda x, u, p: ((p[0] * u[0] - p[2] * max(-1.0, min(1.0, x[0])) - x[0]) / p[1],),
+)
+
+
+@pytest.mark.parametrize(
+    "pwm",
+    [(2, 30, 58, 86, 114, 142, 170, 198, 226, 254, 2, 30), (0, 120, 250, 120, 0, 60, 180)],
+    ids=["upwards", "to and fro"],
+)
+def test_nothing_is_found_that_physics_forbids(pwm):
+    """Lines led to a friction that changes by -427 % of its mean, and a negative time constant."""
+    log = opened(pwm)
+    fitted = GASSI(FIRST_ORDER, population=60, generations=12).fit(log)
+    findings = score_tests_of(fitted, [log]).findings(fitted.uncertainty([log]))
+    moves = [
+        move for finding in findings for move in finding.moves if "(" not in move.quantity.name
+    ]
+    assert moves and all(move.quantity.value + move.change >= 0.0 for move in moves)
+    changes = [finding.amplitude for finding in findings if finding.kind == "change"]
+    assert all(abs(change) < 3.0 for change in changes)
