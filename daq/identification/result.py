@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from sysid.uncertainty import Estimate, Profile, Uncertainty
 
 
+_EXPLAINED = 80.0  # fit [%] of training, above which a search did not get stuck
 _NOT_OF_DESIGNS = {"outputs", "terms", "channels"}  # they change the model, and are in no result
 _RMSE = "mean over outputs of the RMSE on outputs normalised by max|y|"
 _CEGA = "mean over outputs of squares by range, weighed by the size of the velocity (4.6)"
@@ -234,6 +235,10 @@ class Identification(Shown):
             )
         if (remedy := self.remedy) is not None:
             return remedy
+        if self._fits_training_alone and not self.interrupted:
+            return NextStep(
+                "See whether any parameters explain what was held back as well:", self._all_in_one
+            )
         if self._searched_in_vain and not self.interrupted:
             settings = self.problem.settings
             longer = {"seed": settings.seed + 1, "population": 2 * settings.population}
@@ -256,6 +261,22 @@ class Identification(Shown):
             return None
         purpose = f"{knowledge(wide)}. To design runs that would narrow them:"
         return NextStep(purpose, command)
+
+    @property
+    def _fits_training_alone(self) -> bool:
+        """Whether training is explained so well that no longer search would better validation."""
+        fits = [log.result.metrics.fit for log in self.training]
+        poor = self.verdict.predicted.trust == "poor" and bool(self.validation)
+        return poor and bool(np.nanmin(fits) > _EXPLAINED)
+
+    @property
+    def _all_in_one(self) -> str:
+        """The command of this identification with nothing held back."""
+        logs = dict.fromkeys(str(log.log.path) for log in (*self.training, *self.validation))
+        request = self.problem.request
+        as_option = request.options.get("hold_back") is not None
+        nothing = ["hold_back=0"] if self.problem.settings.hold_back and not as_option else []
+        return shlex.join(["rig", "identify", *logs, *request.words(nothing, hold_back=None)])
 
     @property
     def _searched_in_vain(self) -> bool:

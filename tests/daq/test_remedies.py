@@ -214,3 +214,26 @@ def test_a_position_starts_where_all_samples_say_and_commands_go_on_from_there(t
     )
     kept = identify(log, model=model, watch=notes.append, initial={"x": "first"})
     assert kept.estimator.initial_states_ == []
+
+
+def test_where_training_is_explained_what_comes_next_is_no_longer_search(tmp_path):
+    """A slide that rubs twice as much when it is validated: no search of training finds that."""
+    dry, wet = slide_log(3.0), slide_log(6.0)
+    moved = {
+        "t": wet["t"] + 2.0 * dry["t"].iloc[-1] - dry["t"].iloc[-2],
+        "x": wet["x"] + dry["x"].iloc[-1],
+    }
+    paths = [tmp_path / f"{name}.csv" for name in ("dry", "wet", "both")]
+    for path, log in zip(paths, (dry, wet, pd.concat([dry, wet.assign(**moved)])), strict=True):
+        log.to_csv(path, index=False)
+    quick = {"model": slide_model(tmp_path), "population": 40, "generations": 8}
+    for asked, logs in (
+        ({"data": paths[0], "validate": paths[1]}, paths[:2]),
+        ({"data": paths[2], "hold_back": 0.5}, paths[2:]),
+    ):
+        apart = identify(asked.pop("data"), **asked, **quick)
+        assert apart.verdict.predicted.trust == "poor"
+        assert apart.next_step.purpose.startswith("See whether any parameters explain")
+        command = apart.next_step.command
+        assert command.startswith(f"rig identify {' '.join(map(str, logs))} --")
+        assert "--validate" not in command and "hold_back=0.5" not in command
