@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -50,12 +51,11 @@ class CoSimulation:
             if v.name in self._plant.parameters
         ]
         try:
-            self._unit = instantiate_fmu(
-                self._folder.name,
-                description,
-                "CoSimulation",
-                logger=self._heard,
-            )
+            # FMPy goes to the library's folder and stays there when that cannot be loaded.
+            with contextlib.chdir("."):
+                self._unit = instantiate_fmu(
+                    self._folder.name, description, "CoSimulation", logger=self._heard
+                )
             if self._is_second:
                 self._unit.setupExperiment(startTime=0.0)
             for reference, value in starts:

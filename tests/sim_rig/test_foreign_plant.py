@@ -153,3 +153,13 @@ def test_a_unit_that_cannot_be_the_plant_is_refused_where_the_file_names_it(tmp_
     assert "there is no real 'j'" in refused(RIG + "    parameters: {j: 1.0}\n")
     assert "leave those out" in refused(RIG + "  plant: {load: free}\n")
     assert "another FMU than" in refused(RIG + f"    sha256: {'f' * 64}\n")
+
+
+def test_a_binary_that_cannot_be_loaded_leaves_the_working_folder_as_it_was(tmp_path, monkeypatch):
+    write_unit(tmp_path / "motor.fmu", b"no library", platform=fmpy.platform)
+    (tmp_path / "rig.yaml").write_text(RIG)
+    monkeypatch.chdir(tmp_path)
+    _, device = load_rig("rig.yaml")
+    with pytest.raises(DeviceError, match=r"motor.fmu does not start"):
+        played(device, np.zeros((4, 2)))
+    assert Path.cwd() == tmp_path
