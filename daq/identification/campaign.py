@@ -152,15 +152,11 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
     >>> len(result.campaign.outcomes), result.table.name
     (2, 'campaign.csv')
     """
-    logs = [*wanted.logs, *wanted.validate]
-    problems = problems_of(wanted.settings, distinct(wanted.models), watch, logs=logs)
-    seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
+    groups = _all_groups(wanted, watch)
+    seeds = parse_seeds(wanted.seeds) or [groups[0].problem.settings.seed]
     now = datetime.datetime.now(datetime.UTC)
     folder = wanted.out or Path("campaigns") / f"{now:%Y%m%dT%H%M%SZ}"
     check_writable(folder)
-    groups = []
-    for problem in problems:
-        groups += groups_of(problem, wanted.logs, wanted.validate, wanted.together)
     outcomes: list[Outcome] = []
     written = -math.inf
 
@@ -181,11 +177,27 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
         raise
     table = _write_table(folder, result)
     by_key = {(group.problem.model_name, group.name): group for group in groups}
-    files = {
-        key: by_key[key].result(outcome).save(folder / f"best-{place}")
-        for place, (key, outcome) in enumerate(result.best().items(), 1)
-    }
+    best, files = result.best(), {}
+    for place, (key, outcome) in enumerate(best.items(), 1):
+        files[key] = by_key[key].result(outcome).save(folder / f"best-{place}")
+        watch(Progress("Intervals", place, len(best), f"{place}/{len(best)} of the best runs"))
     return CampaignResult(result, table, files)
+
+
+def _all_groups(wanted: CampaignRequest, watch: Watch) -> list[Group]:
+    """Every log by itself, or all together, under every model, or its own where none is named."""
+    if wanted.together or wanted.models:
+        names = distinct(wanted.models)
+        sets = [list(wanted.logs)] * len(names)
+    else:
+        sets = records.by_intended_model(wanted.logs)
+        names = [None] * len(sets)
+    with_validation = [[*logs, *wanted.validate] for logs in sets]
+    problems = problems_of(wanted.settings, names, watch, logs_of=with_validation)
+    groups = []
+    for problem, logs in zip(problems, sets, strict=True):
+        groups += groups_of(problem, logs, wanted.validate, wanted.together)
+    return groups
 
 
 def run_all(

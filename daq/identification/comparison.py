@@ -174,7 +174,8 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     if wanted.seeds is not None and wanted.settings.options.get("seed") is not None:
         raise ConfigError("--seed and --seeds: give one of them")
     logs = [*wanted.logs, *wanted.validate]
-    problems = problems_of(wanted.settings, distinct(wanted.models), watch, logs=logs)
+    names = distinct(wanted.models)
+    problems = problems_of(wanted.settings, names, watch, logs_of=[logs] * len(names))
     seeds = parse_seeds(wanted.seeds) or [problems[0].settings.seed]
     alone = len(problems) == 1 and not wanted.baselines
     name = problems[0].model.name if alone else "comparison"

@@ -98,13 +98,12 @@ def intended_model(paths: Iterable[Path]) -> str | None:
     for a Python file, which a run's record is not to choose.
     """
     runs: dict[str, Path] = {}
-    for csv in (log_path(log) for path in paths for log in expand(path)):
-        experiment, _ = settings_of(read_record(csv) or {})
-        if experiment:
-            runs.setdefault(str(experiment.get("model") or DEFAULT_MODEL), csv.parent)
+    for log in (log for path in paths for log in expand(path)):
+        if (named := _named_model(log)) is not None:
+            runs.setdefault(named, log_path(log).parent)
     if len(runs) > 1:
         each = ", ".join(f"{name} ({run})" for name, run in runs.items())
-        cure = "name one with --model, or identify them apart"
+        cure = "name one with --model, or identify them apart, as rig campaign does"
         raise ConfigError(
             f"the experiments of these runs are for different models: {each}", cure=cure
         )
@@ -119,6 +118,20 @@ def intended_model(paths: Iterable[Path]) -> str | None:
         except ConfigError as error:
             raise ConfigError.of(mistake.behind(place) for mistake in error.mistakes) from None
     return next(iter(runs), None)
+
+
+def by_intended_model(paths: Iterable[Path]) -> list[list[Path]]:
+    """Logs in lists, of which each is for one model as far as runs name one."""
+    logs: dict[str | None, list[Path]] = {}
+    for log in (log for path in paths for log in expand(path)):
+        logs.setdefault(_named_model(log), []).append(log)
+    return list(logs.values())
+
+
+def _named_model(log: Path) -> str | None:
+    """The model that a run's experiment is for; None for a log of another program."""
+    experiment, _ = settings_of(read_record(log_path(log)) or {})
+    return str(experiment.get("model") or DEFAULT_MODEL) if experiment else None
 
 
 def _begun(log: Path) -> bool:

@@ -91,7 +91,7 @@ def problem_of(
     record: which the request comes from, and whose files of models are not to be run. logs: whose
     columns are looked for as well, and whose experiments name the model where nothing else does.
     """
-    return problems_of(request, [request.options.get("model")], watch, record, logs)[0]
+    return problems_of(request, [request.options.get("model")], watch, record, [logs])[0]
 
 
 def problems_of(
@@ -99,12 +99,12 @@ def problems_of(
     names: Sequence[str | None],
     watch: Watch = ignore,
     record: Path | None = None,
-    logs: Sequence[Path] = (),
+    logs_of: Sequence[Sequence[Path]] | None = None,
 ) -> list[Problem]:
-    """The same settings for each of several models, None for that of the settings or the logs.
+    """The same settings for each of several models, None for that of the settings or its logs.
 
     Each takes the ranges, fixed values and the like that it has a name for; names that no model
-    has are mistakes.
+    has are mistakes. logs_of: of each model, as ``logs`` of ``problem_of``.
     """
     config = None if request.config is None else Path(request.config)
     options = {k: value for k, value in request.options.items() if value is not None}
@@ -112,7 +112,8 @@ def problems_of(
     if written is not None:
         check.refuse_other_kind(written, "an identification's settings")
     file = TypedSettings.of(options, request.settings, written)
-    declared = _find_models(config, file, names, record, logs)
+    logs_of = logs_of or [()] * len(names)
+    declared = _find_models(config, file, names, record, logs_of)
     file, freed = _without_nulls(file, [model for model, _ in declared])
     file, unconverted = in_model_units(file, [model for model, _ in declared])
     plain = [model for model, _ in declared]
@@ -152,7 +153,7 @@ def problems_of(
     beside = config.parent if config is not None and "given" not in file.typed else Path()
     results = attempt(lambda: stages.load([beside / name for name in settings.given]), [])
 
-    def problem(model: ProcessModel, name: str) -> Problem:
+    def problem(model: ProcessModel, name: str, logs: Sequence[Path]) -> Problem:
         given = _restricted(settings, model)
         earlier, sources = stages.under(given, results, model, freed)
         sheet = {n: entry for n, entry in entries.items() if n not in freed or n in given.tied}
@@ -177,7 +178,10 @@ def problems_of(
 
     _, *problems = _in_order(
         partial(check.refuse, doubts),
-        *[partial(problem, model, name) for (_, name), model in zip(declared, models, strict=True)],
+        *[
+            partial(problem, model, name, logs)
+            for (_, name), model, logs in zip(declared, models, logs_of, strict=True)
+        ],
     )
     return problems
 
@@ -321,11 +325,14 @@ def _find_models(
     file: TypedSettings,
     names: Sequence[str | None],
     record: Path | None,
-    logs: Sequence[Path],
+    logs_of: Sequence[Sequence[Path]],
 ) -> list[tuple[ProcessModel, str]]:
     """Models and their whole names; when one is not found, the file's other mistakes as well."""
     try:
-        return [_find_model(config, file, name, record, logs) for name in names]
+        return [
+            _find_model(config, file, name, record, logs)
+            for name, logs in zip(names, logs_of, strict=True)
+        ]
     except ConfigError as error:
         if error.key == "model":
             check.validate(file, IdentificationConfig, others=error.mistakes)

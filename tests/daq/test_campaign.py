@@ -11,7 +11,16 @@ import yaml
 from daq.errors import ConfigError
 from daq.identification import campaign as use_case
 from daq.identification.campaign import Workers, parse_seeds
-from tests.daq.support import rig, slide_log, slide_model, start_rig, until
+from tests.daq.support import (
+    few_free,
+    rig,
+    slide_log,
+    slide_model,
+    start_rig,
+    until,
+    write_experiment,
+    write_yaml,
+)
 
 MODELS = """\
 from sysid import Input, Output, Parameter, ProcessModel, State
@@ -114,6 +123,21 @@ def test_what_a_campaign_keeps_starts_where_its_fit_did(tmp_path):
     assert replayed.returncode == 0, replayed.stderr
     rmse = json.loads(replayed.stdout)["outputs"]["x"]["rmse_absolute"]
     assert rmse == pytest.approx(document["runs"][0]["rmse_x"], rel=1e-3) and rmse < 0.0105  # noise
+
+
+def test_each_run_is_identified_with_the_model_of_its_experiment(tmp_path):
+    models = {"bouc": "actuator", "dahl": "actuator:hysteresis=dahl"}
+    for name, model in models.items():
+        written = write_experiment(tmp_path / f"{name}.yaml", model=model)
+        assert rig("run", written, cwd=tmp_path).returncode == 0
+    write_yaml(tmp_path / "id.yaml", {**few_free(), "preset": "thesis"})
+    result = rig("campaign", "runs", "--config", "id.yaml", "--out", "found", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = pd.read_csv(tmp_path / "found" / "campaign.csv")
+    assert dict(zip(rows["data"].str.split("-").str[-1], rows["model"], strict=True)) == models
+    assert "Intervals: 2/2 of the best runs" in result.stderr
+    together = rig("campaign", "runs", "--config", "id.yaml", "--together", cwd=tmp_path)
+    assert together.returncode == 2 and "are for different models" in together.stderr
 
 
 @pytest.mark.soak
