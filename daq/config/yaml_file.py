@@ -141,7 +141,8 @@ def _setting(text: str) -> dict[str, Any]:
     if not equals or not all(keys) or len(keys) > bounds.DEEPEST:
         raise ConfigError("write KEY=VALUE, for example ranges.K_m=[0.1,0.2]", key=option)
     try:
-        content: Any = _built(value, None)[1]
+        # An alias has nothing to stand for here: it is a pattern, as of ``merge``.
+        content: Any = value if value.startswith("*") else _built(value, None)[1]
     except yaml.YAMLError:
         raise ConfigError(f"{_short(value)!r} is not valid YAML", key=option) from None
     except ConfigError as error:

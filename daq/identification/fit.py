@@ -285,8 +285,7 @@ def check_writable(folder: Path) -> None:
 def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
     """What is wrong with the data of logs for training and for validation, as they were read."""
     model = problem.model
-    measured = [[log.measured or log.dataset for log in part] for part in logs]
-    faults = data_faults(model, *measured)
+    faults = data_faults(model, *[[log.unmended for log in part] for part in logs])
     if problem.selection.robust:
         faults = after_mending(faults, model)
     units: list[DataFault] = []

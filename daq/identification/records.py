@@ -71,6 +71,13 @@ class LoggedRecord(Shown):
         n, dt = self.dataset.n_samples, self.dataset.dt
         return f"{self.dataset.name}, {n} samples, {n * dt:.4g} s at {1.0 / dt:.4g} Hz"
 
+    @property
+    def unmended(self) -> Dataset:
+        """Its record in which faults of samples show: a low-pass makes overshoots of levels."""
+        if self.measured is not None:
+            return self.measured
+        return self.dataset if self.preparation is None else self.preparation.before
+
 
 Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for validation
 

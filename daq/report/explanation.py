@@ -75,13 +75,14 @@ def _determined(document: Mapping[str, Any], rows: Rows) -> str:
     alone, free, together = len(rows.determined), len(rows.free), len(rows.combinations)
     if alone == free:
         return f"The data determine all {alone} free parameters, each by itself."
-    bounded = f", bound {len(rows.bounded)} more on one side," if rows.bounded else ""
-    combined = f"{bounded} and {_count(together, 'combination')} of others" if together else bounded
+    bounded = f", and bound {len(rows.bounded)} more on one side" if rows.bounded else ""
+    combined = f" and {_count(together, 'combination')} of others" if together else ""
     outputs = "; the model's outputs are as good with any of their values that fit"
     usable = "" if document["verdict"]["predictions"]["trust"] == "poor" else outputs
+    rest = f" The rest is not to be used one by one{usable}."
     return (
         f"The data determine {alone} of {_count(free, 'free parameter')} by themselves{combined}"
-        f". The rest is not to be used one by one{usable}."
+        f"{bounded}.{rest if alone + len(rows.bounded) < free else ''}"
     )
 
 

@@ -209,6 +209,30 @@ def test_a_gap_is_cut_out_by_the_setting_that_is_named_for_it(folder):
     assert faults(*gap.settings) == ()
 
 
+def test_what_is_wrong_with_a_log_is_told_of_it_as_logged(folder):
+    """A low-pass rings beside levels, which looks like clipping, and closes short gaps."""
+    rng = np.random.default_rng(0)
+    inputs = np.repeat(rng.choice([-1.0, 1.0], 150), 40)
+    outputs = np.zeros(len(inputs))
+    for k, u in enumerate(inputs[:-1]):
+        outputs[k + 1] = GAIN * u + (outputs[k] - GAIN * u) * np.exp(-DT / TAU)
+    outputs += 0.01 * rng.standard_normal(len(outputs))
+    table = pd.DataFrame({"t": DT * np.arange(len(inputs)), "u": inputs, "y": outputs})
+    table.drop(index=range(3000, 3030)).to_csv(folder / "day1.csv", index=False)
+    problem(folder, decimate=4)
+    request = SettingsRequest(str(folder / "id.yaml"))
+    result = identify_files([folder / "day1.csv"], [], request, folder / "out", lambda _: None)
+    assert {fault.kind for fault in result.faults} == {"gap"}
+
+
+def test_a_pattern_of_files_is_typed_as_in_a_file(folder):
+    words = "--set", "merge=*_force.csv", "--population", "20", "--generations", "3"
+    problem(folder)
+    done = rig("identify", "day1.csv", "--config", "id.yaml", *words, "--no-report", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "merged with day1_force.csv" in done.stderr
+
+
 def test_a_replay_reads_a_log_as_the_identification_did(folder):
     problem(folder)
     log = clean()

@@ -297,6 +297,23 @@ def test_a_doubtful_validation_may_feel_what_the_training_hardly_does(document):
     assert asked() == []
 
 
+def test_parameters_that_are_bounded_are_no_part_of_the_rest(document):
+    changed = copy.deepcopy(document)
+    plain = SimpleNamespace(parameters=(), state_names=())
+
+    def sentence():
+        return explanation.view(plain, changed, Rows.of(changed))["determined"]
+
+    name = next(n for n, p in changed["parameters"].items() if p.get("interval"))
+    changed["parameters"][name]["interval"][1] = None
+    assert ", and bound 1 more on one side. The rest is not to be used" in sentence()
+    for parameter in changed["parameters"].values():
+        if not parameter.get("interval"):
+            parameter["source"] = "fixed"
+            parameter.pop("range", None)
+    assert sentence().endswith(", and bound 1 more on one side.")
+
+
 def test_latex_holds_every_parameter_and_compiles(result, document, work, tmp_path):
     table = (work / "found/parameters.tex").read_text(encoding="utf-8")
     rows = [line for line in table.splitlines() if line.endswith(r"\\")][1:]
