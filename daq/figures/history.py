@@ -17,7 +17,6 @@ from daq.hal import FloatArray
 
 _SIGNAL, _TREND = 0.62, 0.48  # in, heights of panels
 _GAP, _ABOVE, _BETWEEN = 0.13, 0.2, 0.62  # in, between signals, parameters, and both
-_DIGITS = 3  # of the numbers beside an axis
 _DATES = 6  # marks of the axis of dates at most
 _CROWD = 60  # runs, from which on their marks would run together
 
@@ -111,10 +110,12 @@ def _draw_trend(axis: Axes, trend: Trend) -> None:
     # Above the panel: a combination's name would not stand upright beside it.
     name = f"{notation.label(trend.name)} {notation.bracketed(trend.unit)}"
     axis.text(0.0, 1.04, name, transform=axis.transAxes, va="bottom")
-    axis.yaxis.set_major_formatter(lambda value, _: notation.number(value, _DIGITS))
+    axis.yaxis.set_major_formatter(style.tick)
     # With at least two marks there is a step for every span.
     locator = AutoDateLocator(minticks=2, maxticks=_DATES)  # type: ignore[no-untyped-call]
     axis.xaxis.set_major_locator(locator)
     formatter = ConciseDateFormatter(locator, tz=datetime.UTC)  # type: ignore[no-untyped-call]
     axis.xaxis.set_major_formatter(formatter)
     axis.margins(x=0.06, y=0.15)
+    if np.ptp(when) == 0.0:  # an hour about one instant, not years
+        axis.set_xlim(when[0] - 0.04, when[0] + 0.04)

@@ -196,7 +196,19 @@ def _mark_digits(axis: Axis) -> None:
 
 def _power(value: float, _place: int | None = None) -> str:
     """A power of ten, or a multiple of one."""
-    mantissa, power = f"{value:.0e}".split("e")
+    return _typeset(f"{value:.0e}")
+
+
+def tick(value: float, _place: int | None = None) -> str:
+    """A number beside a linear axis, in three digits or as few as it has."""
+    return _typeset(notation.shortest(float(f"{value:.3g}")))
+
+
+def _typeset(text: str) -> str:
+    """A printed number (``5.4e-4``) as mathematics has it."""
+    mantissa, _, power = text.replace("-", "−", text.startswith("-")).partition("e")
+    if not power:
+        return mantissa
     times = "" if mantissa == "1" else f"{mantissa}·"
     return f"{times}10{notation.raised(str(int(power)))}"
 

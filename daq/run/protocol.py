@@ -136,7 +136,9 @@ class Dialogue:
         if not (
             motor_low <= answer.motor <= motor_high and brake_low <= answer.brake <= brake_high
         ):
-            (motor_low, brake_low), (motor_high, brake_high) = self._plan.lowest, self._plan.highest
+            # With 0.0 added a zero has no minus before it.
+            (motor_low, brake_low) = np.asarray(self._plan.lowest) + 0.0
+            (motor_high, brake_high) = np.asarray(self._plan.highest) + 0.0
             raise ValueError(
                 f"it answered motor {answer.motor!r} V, brake {answer.brake!r} V, and its plan "
                 f"says {motor_low:g} to {motor_high:g} V and {brake_low:g} to {brake_high:g} V"

@@ -1,5 +1,6 @@
 """Figures: every axis says what it shows and in which unit, nothing is cut, files are of a kind."""
 
+import datetime
 import re
 import xml.etree.ElementTree as ET
 
@@ -10,6 +11,7 @@ import pytest
 from daq.figures import style
 from daq.figures.bode import bode
 from daq.figures.findings import draw, plot
+from daq.figures.history import Overlay, Trend, history
 from daq.figures.parameters import convergence, correlation, intervals, ranges, ratios
 from daq.figures.signals import Panel, responses, signals, spectra
 from daq.findings import Axis, Chart, Heatmap, Series
@@ -215,3 +217,15 @@ def test_phases_go_on_beyond_a_turn_and_estimates_have_gaps_without_coherence():
     gaps = np.isnan(np.asarray(estimated.get_ydata(), dtype=float))
     assert gaps.tolist() == (seen < 0.3).tolist()
     assert figure.axes[1].get_ylim()[0] < -720.0
+
+
+def test_a_parameter_of_one_evening_has_short_numbers_and_no_years_beside_it():
+    evening = datetime.datetime(2026, 1, 2, 18, tzinfo=datetime.UTC)
+    values = np.array([[1.05e-4, 1.0e-4, 1.1e-4]])
+    overlay = Overlay("omega", "rad/s", {"run": (TIME, WAVE)})
+    figure = history([overlay], [Trend("J_m", "kg*m^2", [evening], values)])
+    figure.canvas.draw()
+    panel = figure.axes[-1]
+    labels = {label.get_text() for label in panel.get_yticklabels()}
+    assert "10⁻⁴" in labels and not any("e" in label or "0·" in label for label in labels)
+    assert np.ptp(panel.get_xlim()) < 1.0  # d
