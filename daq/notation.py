@@ -14,6 +14,7 @@ _GREEK = {
     "eta": "η", "theta": "θ", "kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ",
     "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ", "chi": "χ", "psi": "ψ", "omega": "ω",
 }  # fmt: skip
+JOINTS = "-_,:/"  # behind which a long name may be broken
 _SYMBOL = re.compile(rf"({'|'.join(_GREEK)}|[A-Za-z])(\d*)(?:_([A-Za-z0-9]+))?(\(0\))?")
 _ATOM = re.compile(r"([^\W\d]\w*(?:\(0\))?)")
 _TEX = str.maketrans({

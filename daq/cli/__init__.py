@@ -108,7 +108,7 @@ def _status(end: BaseException | None) -> int | str | None:
     if isinstance(end, RigError):
         return _report(end, str(end), end.exit_status)
     if end is not None and _is_stopped(end):
-        return _report(end, f"stopped by {end if isinstance(end, Terminated) else 'Ctrl-C'}")
+        return _report(end, f"stopped by {_stopper(end)}")
     if isinstance(end, SystemExit):
         if end.code or unwritten is None:
             return end.code
@@ -126,6 +126,15 @@ def _is_stopped(end: BaseException | None) -> bool:
     """Whether a signal ended the command."""
     interrupted = isinstance(end, SystemExit) and end.code == _INTERRUPTED
     return interrupted or isinstance(end, KeyboardInterrupt | Terminated)
+
+
+def _stopper(end: BaseException | None) -> str:
+    """Who ended a command: a signal's name, or what the run that was stopped says."""
+    while end is not None:
+        if isinstance(end, KeyboardInterrupt | Terminated) and str(end):
+            return str(end)
+        end = end.__context__
+    return "Ctrl-C"
 
 
 def _report(error: BaseException, message: str, status: int = 1) -> int:

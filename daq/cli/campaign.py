@@ -72,20 +72,23 @@ def _show(result: CampaignResult) -> None:
 
     runs = result.campaign
     print()
-    title = (
-        "Error over seeds: mean over outputs of the RMSE in parts of max|y|; then the best's RMSE"
-    )
-    head = ["model", "log", "runs", "best", "median", "worst", "within 1 %", "fit [%]", "failed"]
     models = [outcome.run.model for outcome in runs.outcomes]
     units = {output.name: output.unit for model in models for output in model.outputs}
-    head += [f"RMSE of {name} [{unit}]" for name, unit in units.items()]
     spreads = runs.spread()
     shown = without_folders(spread.model for spread in spreads)
-    rows = [[shown[spread.model], *_spread_row(spread, result, list(units))] for spread in spreads]
     terminal.print_table_of_differences(
-        title, head, rows, once=["model", "runs", "within 1 %", "failed"], text=["log"]
-    )
-    for problem in dict.fromkeys(f"{o.run.name}: {o.problem}" for o in runs.failed):
+        "Error over seeds: mean over outputs of the RMSE in parts of max|y|",
+        ["model", "log", "runs", "best", "median", "worst", "within 1 %", "failed"],
+        [[shown[spread.model], *_spread_row(spread)] for spread in spreads],
+        once=["model", "runs", "within 1 %", "failed"], text=["log"],
+    )  # fmt: skip
+    terminal.print_table_of_differences(
+        "The best of each: mean fit, and RMSE in the outputs' units",
+        ["model", "log", "fit [%]", *(f"{name} [{unit}]" for name, unit in units.items())],
+        [[shown[spread.model], *_best_row(spread, result, list(units))] for spread in spreads],
+        once=["model"], text=["log"],
+    )  # fmt: skip
+    for problem in dict.fromkeys(f"{o.run.name}, {o.run.data}: {o.problem}" for o in runs.failed):
         print(f"Failed: {problem}")
     if runs.interrupted:
         print(f"Stopped by Ctrl-C: {len(runs.outcomes)} runs are in the table.")
@@ -98,11 +101,14 @@ def _show(result: CampaignResult) -> None:
         )
 
 
-def _spread_row(spread: Spread, result: CampaignResult, outputs: Sequence[str]) -> list[str]:
-    best, number = result.campaign.best().get((spread.model, spread.data)), terminal.number
-    errors = [number(error) for error in (spread.best, spread.median, spread.worst)]
+def _spread_row(spread: Spread) -> list[str]:
+    errors = [terminal.number(error) for error in (spread.best, spread.median, spread.worst)]
+    return [spread.data, str(spread.runs), *errors, str(spread.agreeing), str(spread.failed)]
+
+
+def _best_row(spread: Spread, result: CampaignResult, outputs: Sequence[str]) -> list[str]:
+    best = result.campaign.best().get((spread.model, spread.data))
     fit = f"{best.row()['fit']:.1f}" if best is not None else "-"
-    counts = [str(spread.agreeing), fit, str(spread.failed)]
     absolute = best.rmse_absolute if best is not None else {}
-    in_units = [number(absolute.get(name, math.nan), 3) for name in outputs]
-    return [spread.data, str(spread.runs), *errors, *counts, *in_units]
+    in_units = [terminal.number(absolute.get(name, math.nan), 3) for name in outputs]
+    return [spread.data, fit, *in_units]

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
+from daq import notation
 from daq.cli import options, terminal
 
 if TYPE_CHECKING:
     from daq.designs.discrimination import DiscriminationResult
     from daq.designs.result import DesignResult, PlannedRun
+    from sysid.experiments import PredictedQuantity
 
 
 def design(
@@ -75,8 +77,7 @@ def _show(result: DesignResult) -> None:
     rows = [
         [
             quantity.name,
-            number(quantity.value),
-            quantity.unit,
+            *_value(quantity),
             *(number(100.0 * width, 2) for width in (quantity.before, quantity.after)),
             number(100.0 * quantity.widest, 2),
             "-" if quantity.target is None else number(100.0 * quantity.target, 2),
@@ -84,7 +85,10 @@ def _show(result: DesignResult) -> None:
         for quantity in design.quantities
     ]
     head = ["quantity", "value", "unit", "before", "after", "at worst", "wanted"]
-    title = "95 % intervals to be expected: half widths in % of the value"
+    title = (
+        "95 % intervals to be expected: half widths in % of the value, which is the likeliest by "
+        "all that is known, results and ranges together"
+    )
     terminal.print_table(title, head, rows, text=["unit"])
     for unknown in result.unknown:
         names = ", ".join(unknown.names)
@@ -92,6 +96,14 @@ def _show(result: DesignResult) -> None:
             f"Stays unknown: {names}: {unknown.why}. What would tell: {unknown.cure}."
         )
     _show_next(result)
+
+
+def _value(quantity: PredictedQuantity) -> tuple[str, str]:
+    """A quantity's value, in the digits that will be known, and its unit."""
+    factor, unit = notation.engineering(quantity.value, quantity.unit)
+    deviation = abs(quantity.value) * quantity.after / 1.96
+    digits = notation.digits(quantity.value, deviation)
+    return terminal.number(quantity.value * factor, digits), unit
 
 
 def _show_pairs(result: DiscriminationResult) -> None:

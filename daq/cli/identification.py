@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sysid.judging.comparison import Comparison, Row
     from sysid.uncertainty import Profile
 
+_COLOURED = 0.8  # share with itself inside the band, below which residuals are called coloured
 _STRONG = 0.95  # correlation above which two parameters are named together
 
 
@@ -258,6 +259,13 @@ def _show_residuals(rows: Rows) -> None:
     ]
     title = f"Residuals, {table.part}: share of correlations inside their 95 % band"
     terminal.print_table(title, head, cells)
+    coloured = [name for name, (past, *_) in table.shares.items() if past < _COLOURED]
+    if coloured:
+        terminal.print_text(
+            f"Few with itself ({', '.join(coloured)}): coloured residuals, as noise of a measured "
+            "input makes them. The intervals allow for it; few with an input would speak against "
+            "the model."
+        )
 
 
 def _show_notes(result: Identification) -> None:

@@ -35,8 +35,7 @@ _has_document: ContextVar[bool] = ContextVar("has_document", default=False)
 _VOLUMES = {"warning": Volume.QUIET, "note": Volume.NORMAL, "detail": Volume.VERBOSE}
 _VERBOSE_PERIOD = 1.0  # s between lines of progress
 _SPACE = r" +"
-_JOINTS = "-_,:/"  # behind which a name may be wrapped, heads behind the first two
-_JOINT, _JOINT_OF_HEADS = rf"(?<=[{_JOINTS}])| +", r"(?<=[-_])| +"
+_JOINT, _JOINT_OF_HEADS = rf"(?<=[{notation.JOINTS}])| +", r"(?<=[-_])| +"
 _BESIDE_BAR = 70  # columns of a progress line beside its bar: name, status, time
 
 
@@ -281,7 +280,7 @@ def _folded(text: str, width: int, joint: str) -> str:
         return text
     lines = [""]
     for part in _parts(text, joint):
-        between = " " if lines[-1] and lines[-1][-1] not in _JOINTS else ""
+        between = " " if lines[-1] and lines[-1][-1] not in notation.JOINTS else ""
         if len(lines[-1] + between + part) <= width or not lines[-1]:
             lines[-1] += between + part
         else:

@@ -199,7 +199,7 @@ def _power(value: float, _place: int | None = None) -> str:
     return _typeset(f"{value:.0e}")
 
 
-def tick(value: float, _place: int | None = None) -> str:
+def tick(value: float, _place: float | None = None) -> str:
     """A number beside a linear axis, in three digits or as few as it has."""
     return _typeset(notation.shortest(float(f"{value:.3g}")))
 

@@ -19,6 +19,7 @@ from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
 from daq.identification.settings import Problem, gassi_settings, problems_of
 from daq.logs.capture import LOG_NAME
+from daq.lookup.models import without_folders
 from daq.progress import Progress, Watch, ignore, warn
 from daq.provenance import software_versions
 from daq.views import Shown
@@ -218,6 +219,7 @@ def run_all(
     ]
     warn(watch, *dict.fromkeys(doubts))
     runs = [run for group in groups for run in group.runs(seeds)]
+    names = without_folders(run.name for run in runs)
     finished = 0
 
     def report(outcome: Outcome) -> None:
@@ -225,7 +227,8 @@ def run_all(
         finished += 1
         on_outcome(outcome)
         end = "failed" if outcome.problem else f"error {outcome.error:.3g}"
-        status = f"{finished}/{len(runs)} runs, {outcome.run.name}, seed {outcome.run.seed}: {end}"
+        of_run = f"{names[outcome.run.name]}, seed {outcome.run.seed}: {end}"
+        status = f"{finished}/{len(runs)} runs, {of_run}"
         watch(Progress("Identification", finished, len(runs), status))
 
     with workers.ready() as jobs:

@@ -21,7 +21,7 @@ TOPICS = (
     "data", "parameters", "responses", "residuals", "frequency", "torque", "excitation", "search",
 )  # fmt: skip
 _CODE = re.compile("`([^`]+)`")  # what is typed, in sentences
-_JOINT = re.compile(r"(?<=[-_,:/])(?=\w)")  # where a long name may be broken
+_JOINT = re.compile(rf"(?<=[{notation.JOINTS}])(?=\w)")
 _OPTION = re.compile(r"(?<!\S)(--[\w-]+)")  # of a command: not to be broken behind its hyphens
 _TEMPLATES = Path(__file__).parent / "templates"
 

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 _MOTIONS = {"N": ("m", "m/s"), "N*m": ("rad", "rad/s")}  # that a force or torque is drawn over
 _OUTPUTS_A_FIGURE = 4
 _DRAWS = 24  # of the parameters, for bands
+_CLOSER = 60  # samples of a prepared log that are shown closer, as delays are of a few
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
 _FINE = 400  # frequencies over the band at which linear models are drawn
 _COHERENT = 0.5  # coherence above which an input is seen in an output
@@ -144,21 +145,35 @@ def _preparation(subject: Subject) -> Iterator[Picture]:
     shown = next((log for log in logs if log.preparation is not None), None)
     if shown is None or shown.preparation is None:
         return
-    before, after = shown.preparation.before, shown.preparation.after
-    times = before.time, after.time + shown.preparation.start
-    sides = (
-        (subject.model.inputs, before.inputs, after.inputs),
-        (subject.model.outputs, before.outputs, after.outputs),
-    )
+    after = shown.preparation.after
+    half = shown.preparation.start + 0.5 * after.n_samples * after.dt
+    whole, middle = (0.0, np.inf), (half, half + _CLOSER * after.dt)
+    sentence = f"The log {shown.dataset.name} before and after its preparation"
+    yield Picture("preparation", "data", f"{sentence}.", _before_and_after(subject, shown, whole))
+    if after.n_samples > 4 * _CLOSER:
+        closer = f"{sentence}, {_CLOSER} samples in its middle."
+        yield Picture(
+            "preparation-closer", "data", closer, _before_and_after(subject, shown, middle)
+        )
+
+
+def _before_and_after(subject: Subject, log: LoggedRecord, part: tuple[float, float]) -> Figure:
+    """Channels of a prepared log before and after, within a part of its time [s]."""
+    assert log.preparation is not None
+    start, after = log.preparation.start, log.preparation.after
+    times, tables = [], []
+    for record, begin in ((log.preparation.before, 0.0), (after, start)):
+        time = record.time + begin
+        shown = (time >= part[0]) & (time <= part[1])
+        times.append(time[shown])
+        tables.append((record.inputs[shown], record.outputs[shown]))
+    sides = zip((subject.model.inputs, subject.model.outputs), *tables, strict=True)
     panels = [
         Panel(s.name, s.unit, {"as logged": raw, "as used": used}, getattr(s, "hold", "") == "zoh")
         for signals_of_side, *values in sides
         for s, raw, used in zip(signals_of_side, *(table.T for table in values), strict=True)
     ]
-    yield Picture(
-        "preparation", "data",
-        f"The log {shown.dataset.name} before and after its preparation.", overlaid(times, panels),
-    )  # fmt: skip
+    return overlaid((times[0], times[1]), panels)
 
 
 def _excitation(subject: Subject) -> Iterator[Picture]:

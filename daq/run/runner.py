@@ -31,6 +31,7 @@ from daq.run.sampling import Sampling, Watcher, nobody
 from daq.run.signals import SignalHandling
 from daq.views import Lines, Shown
 
+_BY_HAND = "hand (Ctrl-C, or Stop in the scope)"
 _STATUS: dict[type[BaseException], str] = {
     InterlockError: INTERLOCK,
     IncompleteError: "incomplete",
@@ -246,6 +247,8 @@ class _Run:
             self.capture.discard()
             return
         self._finish(status, reason)
+        if isinstance(error, KeyboardInterrupt):
+            error.args = (_BY_HAND,)
         n = log.n_samples if log is not None else 0
         late = self.sampling.timing.flags.get("held", 0)
         punctuality = f", {late} commands came too late" if late else ""
@@ -260,7 +263,7 @@ class _Run:
         """Status and reason of a run that ended by an error."""
         where = f"during {self.sampling.phase.value}"
         if isinstance(error, KeyboardInterrupt):
-            return "stopped", f"stopped by hand (Ctrl-C, or Stop in the scope) {where}"
+            return "stopped", f"stopped by {_BY_HAND} {where}"
         if isinstance(error, Terminated):
             return "stopped", f"stopped by {error} {where}"
         return _STATUS.get(type(error), "failed"), str(error)

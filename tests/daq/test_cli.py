@@ -555,7 +555,7 @@ def test_ctrl_c_before_there_is_any_result_says_so_in_one_line(tmp_path):
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert errors.splitlines()[-1] == "rig: stopped by Ctrl-C"
+    assert errors.splitlines()[-1] == "rig: stopped by hand (Ctrl-C, or Stop in the scope)"
 
 
 @pytest.mark.soak

@@ -29,6 +29,7 @@ from tests.daq.support import (
 )
 from tests.soak import mostly_soak
 
+BY_HAND = "hand (Ctrl-C, or Stop in the scope)"
 FAULTY = {"backend": "faulty", "options": {"journal": "journal.jsonl"}}
 
 
@@ -360,7 +361,7 @@ def test_losing_the_last_samples_of_a_run_is_no_complete_run(tmp_path, plugin):
     ("number", "said", "recorded"),
     mostly_soak(
         [
-            (signal.SIGINT, "Ctrl-C", "hand (Ctrl-C, or Stop in the scope)"),
+            (signal.SIGINT, BY_HAND, BY_HAND),
             (signal.SIGTERM, "SIGTERM", "SIGTERM"),
         ]
     ),
@@ -405,7 +406,7 @@ def test_a_signal_while_the_load_is_wound_is_recorded_with_its_phase(tmp_path):
     out, errors = process.communicate(timeout=30)
     assert process.returncode == 1, errors
     (mistake,) = json.loads(out)["errors"]
-    assert mistake["error"] == "stopped by Ctrl-C"
+    assert mistake["error"] == f"stopped by {BY_HAND}"
     record = record_of(folder)
     assert record["status"] == "stopped" and record["phase"] in {"open", "calibration", "homing"}
     with pytest.raises(ConfigError, match="holds 0 samples"):
