@@ -140,6 +140,16 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
     return text if multiple in ("", "1") else f"{text} {multiple}"
 
 
+def measured(value: float, unit: str, half_width: float | None) -> tuple[str, str]:
+    """A number in the digits that its 95 % interval supports, and the multiple of its unit.
+
+    half_width: of the interval in parts of the value; None without one.
+    """
+    scale, multiple = engineering(value, unit)
+    deviation = None if half_width is None else abs(value) * half_width / 1.96
+    return number(scale * value, digits(value, deviation)), multiple
+
+
 def percent(value: float) -> str:
     """A fit, to a tenth of a per cent."""
     return f"{value:.1f}" if math.isfinite(value) else "-"

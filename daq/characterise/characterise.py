@@ -216,8 +216,11 @@ def _end(request: Request, done: Sequence[Round], result: Mapping[str, Any] | No
         widths = [interval.width for interval in done[-1].intervals(result)]
         if all(w is not None and 100.0 * w <= request.precision for w in widths):
             return f"all that experiments tell is known to {request.precision:g} %"
-    if _spent(done) + done[-1].seconds / len(done[-1].experiments) > request.time * (1.0 + 1e-9):
-        return f"the {request.time:g} s are used up"
+    spent = _spent(done)
+    if spent + done[-1].seconds / len(done[-1].experiments) > request.time * (1.0 + 1e-9):
+        left = request.time - spent
+        short = f", but for {left:.3g} s, less than a run" if left > 1e-3 * request.time else ""
+        return f"the {request.time:g} s are used up{short}"
     return ""
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
+from daq import notation
 from daq.cli import completion, options, terminal
 from daq.cli.identification import print_verdict
 from daq.config.units import converted
@@ -100,15 +101,15 @@ def _show(result: Characterisation) -> None:
     rows = [
         [
             interval.name,
-            number(interval.value),
-            interval.unit,
+            *notation.measured(interval.value, interval.unit, interval.width),
             "-" if interval.width is None else number(100.0 * interval.width, 2),
             "-" if interval.expected is None else number(100.0 * interval.expected, 2),
         ]
         for interval in result.intervals
     ]
     print()
-    spent = f"{result.seconds:g} s in {len(result.rounds)} rounds"
+    n = len(result.rounds)
+    spent = f"{result.seconds:g} s in {n} round{'s' * (n != 1)}"
     title = f"After {spent}: 95 % intervals in % of the value"
     head = ["quantity", "value", "unit", "half width", "expected"]
     terminal.print_table(title, head, rows, text=["unit"])

@@ -15,7 +15,6 @@ from daq.cli import options, terminal
 if TYPE_CHECKING:
     from daq.designs.discrimination import DiscriminationResult
     from daq.designs.result import DesignResult, PlannedRun
-    from sysid.experiments import PredictedQuantity
 
 
 def design(
@@ -77,7 +76,7 @@ def _show(result: DesignResult) -> None:
     rows = [
         [
             quantity.name,
-            *_value(quantity),
+            *notation.measured(quantity.value, quantity.unit, quantity.after),
             *(number(100.0 * width, 2) for width in (quantity.before, quantity.after)),
             number(100.0 * quantity.widest, 2),
             "-" if quantity.target is None else number(100.0 * quantity.target, 2),
@@ -96,14 +95,6 @@ def _show(result: DesignResult) -> None:
             f"Stays unknown: {names}: {unknown.why}. What would tell: {unknown.cure}."
         )
     _show_next(result)
-
-
-def _value(quantity: PredictedQuantity) -> tuple[str, str]:
-    """A quantity's value, in the digits that will be known, and its unit."""
-    factor, unit = notation.engineering(quantity.value, quantity.unit)
-    deviation = abs(quantity.value) * quantity.after / 1.96
-    digits = notation.digits(quantity.value, deviation)
-    return terminal.number(quantity.value * factor, digits), unit
 
 
 def _show_pairs(result: DiscriminationResult) -> None:

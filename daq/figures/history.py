@@ -71,9 +71,10 @@ def history(overlays: Sequence[Overlay], trends: Sequence[Trend]) -> Figure:
 @style.styled
 def narrowing(seconds: FloatArray, names: Sequence[str], widths: FloatArray) -> Figure:
     """Half widths of intervals [%] after so many logged seconds, (n_rounds, n_names)."""
-    labels = [notation.label(name) for name in names]
+    seen = np.flatnonzero(np.isfinite(widths).any(axis=0))
+    labels = [notation.label(names[int(place)]) for place in seen]
     figure, (panel,) = style.stack([2.4], top=style.legend_room(labels))
-    for place, (label, width) in enumerate(zip(labels, widths.T, strict=True)):
+    for place, (label, width) in enumerate(zip(labels, widths.T[seen], strict=True)):
         panel.plot(
             seconds, width, marker="o", ms=2.8, lw=0.9, label=label,
             color=style.CYCLE[place % len(style.CYCLE)],

@@ -77,6 +77,7 @@ def rendered(
         "sized": _sized,
         "command": lambda text: Markup(_OPTION.sub(r"<b>\1</b>", str(escape(text)))),
         "jointed": lambda name: Markup(_JOINT.sub("<wbr>", str(escape(name)))),
+        "measured": _measured,
         "percent": lambda value: _marked(value, notation.percent),
         "marked": lambda text: Markup(_CODE.sub(r"<code>\1</code>", str(escape(text)))),
     }
@@ -103,6 +104,12 @@ def _sized(value: float | None, unit: str) -> Markup:
     scale, multiple = notation.engineering(value, unit)
     number = _marked(value, lambda value: notation.number(scale * value, 3))
     return Markup(f"{number} {escape(notation.unit_text(multiple))}".rstrip())
+
+
+def _measured(value: float, unit: str, half_width: float | None) -> tuple[Markup, str]:
+    """A number as fine as its interval supports, and the multiple of its unit."""
+    text, multiple = notation.measured(value, unit, half_width)
+    return _marked(value, lambda _: text), notation.unit_text(multiple)
 
 
 def _marked(value: float | None, write: Callable[[float], str]) -> Markup:

@@ -117,8 +117,9 @@ class Objective:
         return self._with(space=space)
 
     def weighed(self, weights: FloatArray) -> Self:
-        """The same objective with other weights of the outputs, (n_outputs,)."""
-        return self._with(weights=weights / weights.sum(), smooth=True)
+        """The same objective with other weights of the outputs, (n_outputs,), 0 of those unseen."""
+        seen = np.where(self.counts > 0, weights, 0.0)
+        return self._with(weights=seen / seen.sum(), smooth=True)
 
     def on(self, records: Sequence[Dataset], places: Sequence[int] | None = None) -> Objective:
         """The same objective, scales included, on parts of its records.

@@ -295,6 +295,8 @@ def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]
     score = np.einsum("tip,ti,i->p", local.slopes, residual, weight)
     for j in np.flatnonzero((fitted.weights > 0.0) & (fitted.counts > 1)):
         squares = residual[local.seen[:, j], j] ** 2
+        if not squares.any():  # an output that never errs
+            continue
         deviation = squares.std() / squares.mean() / np.sqrt(len(squares))
         chromosome, fall = local.chromosome[None], 0.0
         noise = fitted.noise.copy()

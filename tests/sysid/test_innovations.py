@@ -793,3 +793,29 @@ def test_equations_that_branch_are_fitted_as_before_and_refused_where_asked_for(
     assert "cannot be differentiated" in fit.criterion_reason_
     with pytest.raises(ModelError, match="write conditions with abs, min, max"):
         GASSI(model, criterion="innovations").fit(record)
+
+
+def still_beside_a_lag():
+    return ProcessModel(
+        name="still",
+        states=(State("y", "m"), State("rest", "m")),
+        inputs=(Input("u", "m"),),
+        outputs=(Output("y", "m"), Output("rest", "m")),
+        parameters=(Parameter("tau", "s", 0.1, 0.02, 0.5, "log"),),
+        derivative=lambda x, u, p: ((u[0] - x[0]) / p[0], -x[1] / p[0]),
+    )
+
+
+def test_an_output_that_never_moves_is_no_matter_for_a_filter():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 40), 10)
+    y = np.zeros((len(u), 2))
+    for k in range(len(u) - 1):
+        y[k + 1, 0] = u[k] + (y[k, 0] - u[k]) * np.exp(-0.01 / 0.1)
+    y[:, 0] += 0.003 * rng.standard_normal(len(u))
+    seen = u + 0.02 * rng.standard_normal(len(u))
+    record = Dataset(seen, y, 0.01, input_noise=[0.02])
+    settings = {"population": 20, "generations": 3, "criterion": "innovations"}
+    fitted = GASSI(still_beside_a_lag(), **settings).fit(record)
+    (tau,) = fitted.uncertainty(record).determined()
+    assert tau.low < 0.1 < tau.high
