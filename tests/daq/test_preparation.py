@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from daq import ConfigError
+from daq.files import digest
 from daq.identification import records
 from daq.identification.fit import identify_files
 from daq.identification.request import SettingsRequest
@@ -144,6 +145,8 @@ def test_a_log_is_merged_moved_cut_and_decimated_and_the_report_shows_it(folder)
     publish(result, folder / "out")
     page = (folder / "out" / "report.html").read_text()
     assert 'id="preparation"' in page and "y 4 ms earlier" in page
+    for log in ("day1.csv", "day1_force.csv"):
+        assert digest(folder / log) in page
     drawn = redraw(folder / "out", ["png"], folder / "again", trust=True)
     names = {path.stem for path in drawn}
     assert {"preparation", "preparation-closer"} <= names
