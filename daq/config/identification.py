@@ -415,6 +415,12 @@ class IdentificationConfig(Signals):
         "measured, in the model's units or with their own; default as calibrated, else not known",
         examples=[{"torque": "7 mN*m"}],
     )
+    averaged: dict[str, Annotated[Seconds, Field(gt=0.0, le=60.0)]] = Field(
+        default_factory=dict,
+        description="outputs whose samples are means over so long before them, as the difference "
+        "of two positions is the mean speed between these; default as a run's log says",
+        examples=[{"omega": "2 ms"}],
+    )
     detrend: dict[str, Literal["constant", "linear"]] = Field(
         default_factory=dict,
         description="what is taken off channels: their mean (constant) or a straight line (linear)",

@@ -90,11 +90,7 @@ def _of_channels(
             for name, taken in zip(pair, reversed(pair), strict=True):
                 if name in columns and taken in columns:
                     yield f"{columns[name][0]}.column", columns[taken][1].column or taken
-        if finding.kind in ("delay", "filter") and finding.counts and finding.amplitude is not None:
-            late = settings.delay.get(finding.name, 0.0) + finding.amplitude
-            yield f"delay.{finding.name}", shortest(float(f"{late:.3g}"))
-        if finding.kind == "noise" and finding.amplitude is not None:
-            yield f"noise.{finding.name}", shortest(float(f"{finding.amplitude:.2g}"))
+        yield from _as_logged(settings, finding)
         key, column = columns.get(finding.name, ("", None))
         unit = None
         if column is not None and finding.kind == "gain" and finding.amplitude is not None:
@@ -108,6 +104,20 @@ def _of_channels(
             ends = _ERRORS[finding.kind](finding.amplitude)
             text = ", ".join(shortest(float(f"{end:.3g}")) for end in ends)
             yield f"channels.{finding.name}.{finding.kind}", f"[{text}]"
+
+
+def _as_logged(settings: IdentificationConfig, finding: Finding) -> Iterator[tuple[str, str]]:
+    """What a channel's samples are: late, means over a time, or noisy."""
+    name, amplitude = finding.name, finding.amplitude
+    if amplitude is None:
+        return
+    if finding.kind in ("delay", "filter") and finding.counts:
+        late = settings.delay.get(name, 0.0) + amplitude
+        yield f"delay.{name}", shortest(float(f"{late:.3g}"))
+    if finding.kind == "mean" and finding.counts:
+        yield f"averaged.{name}", shortest(float(f"{amplitude:.6g}"))
+    if finding.kind == "noise":
+        yield f"noise.{name}", shortest(float(f"{amplitude:.2g}"))
 
 
 def _taken_for(unit: str, times: float) -> str | None:

@@ -23,6 +23,7 @@ from daq.identification.request import PARAMETERS, resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem, setting_of
 from daq.lookup.models import trust_option
+from daq.notation import quantity
 from daq.provenance import software_versions
 from daq.views import Lines, Shown
 from sysid import Metrics, ProcessModel
@@ -616,12 +617,18 @@ def _by_output(estimator: GASSI, noise: FloatArray | None) -> dict[str, float]:
 def _averaged(result: Identification) -> dict[str, str]:
     """Outputs that their sensor averages, and how that is met."""
     records = [log.log.dataset for log in (*result.training, *result.validation)]
+    told = result.problem.selection.averaged
     return {
-        name: "its samples are means over the time between two edges of the encoder, and so are "
-        "those of the model"
+        name: f"its samples are means over {_window(told.get(name))}, and so are those of the model"
         for j, name in enumerate(result.model.output_names)
         if any(record.windows.size and record.windows[:, j].any() for record in records)
     }
+
+
+def _window(time: float | None) -> str:
+    """Of an output, as a configuration says [s], or else as a run's counts show."""
+    edges = "the time between two edges of the encoder"
+    return edges if time is None else f"the {quantity(time, 's')} before each"
 
 
 def _excerpt(result: Identification) -> dict[str, Any]:

@@ -25,7 +25,8 @@ class Selection:
 
     use: for all logs, or by the name of a capture folder or file, with or without its ending.
     merge: files beside a log with columns that it lacks, ``*`` for its name. noise: of channels,
-    standard deviations in the model's units. file: where all this stands.
+    standard deviations in the model's units. averaged: of outputs, the time [s] before each sample
+    over which it is a mean. file: where all this stands.
     """
 
     use: Stretch | dict[str, Stretch] | None = None
@@ -33,6 +34,7 @@ class Selection:
     robust: bool = False
     merge: tuple[str, ...] = ()
     noise: Mapping[str, float] = field(default_factory=dict)
+    averaged: Mapping[str, float] = field(default_factory=dict)
     preparation: Preparation = AS_IT_IS
     file: YamlFile | None = None
 
@@ -45,8 +47,16 @@ class Selection:
     def under(cls, settings: IdentificationConfig, file: YamlFile | None = None) -> Selection:
         """From settings, and the file that they stand in."""
         preparation = Preparation(settings.delay, settings.detrend, settings.decimate)
-        use, run_in, robust = settings.use, settings.run_in, settings.robust
-        return cls(use, run_in, robust, tuple(settings.merge), settings.noise, preparation, file)
+        return cls(
+            settings.use,
+            settings.run_in,
+            settings.robust,
+            tuple(settings.merge),
+            settings.noise,
+            settings.averaged,
+            preparation,
+            file,
+        )
 
     @property
     def document(self) -> dict[str, Any]:
@@ -54,15 +64,20 @@ class Selection:
         content = {} if self.file is None else self.file.content
         return {key: content[key] for key in KEYS if content.get(key)}
 
-    def check_channels(self, channels: Sequence[str]) -> None:
-        """Raise ConfigError for a channel that is named and that no model has."""
-        named = {key: getattr(self.preparation, key) for key in ("delay", "detrend")}
+    def check_channels(self, channels: Sequence[str], outputs: Sequence[str]) -> None:
+        """Raise ConfigError for a channel, or an output, that is named and that no model has."""
+        named = {
+            "noise": (self.noise, channels, "channel"),
+            "averaged": (self.averaged, outputs, "output"),
+            "delay": (self.preparation.delay, channels, "channel"),
+            "detrend": (self.preparation.detrend, channels, "channel"),
+        }
         mistakes: list[Mistake] = []
-        for key, names in {"noise": self.noise, **named}.items():
+        for key, (names, possible, what) in named.items():
             for name in names:
-                if name not in channels:
-                    cure = suggestion(name, list(channels))
-                    error = self._mistaken((key, name), "the model has no such channel", cure)
+                if name not in possible:
+                    cure = suggestion(name, list(possible))
+                    error = self._mistaken((key, name), f"the model has no such {what}", cure)
                     mistakes += error.mistakes
         if mistakes:
             raise ConfigError.of(mistakes)
@@ -87,6 +102,17 @@ class Selection:
             for names, noises in parts
         )
         return replace(record, input_noise=inputs, output_noise=outputs)
+
+    def with_averages(self, record: Dataset, model: ProcessModel) -> Dataset:
+        """A record with the windows of its outputs as said here."""
+        if not self.averaged:
+            return record
+        shape = (*record.outputs.shape, 2)
+        windows = record.windows.copy() if record.windows.size else np.zeros(shape)
+        for j, name in enumerate(model.output_names):
+            if name in self.averaged:
+                windows[:, j] = (-self.averaged[name], 0.0)
+        return replace(record, windows=windows)
 
     def prepared(self, record: Dataset, path: Path, model: ProcessModel) -> Prepared:
         """A record as ``delay``, ``detrend`` and ``decimate`` have it; ConfigError."""
@@ -164,7 +190,7 @@ def _names(path: Path) -> Sequence[str]:
     return [path.name, path.stem, str(path)]
 
 
-KEYS = ("use", "merge", "noise", "delay", "detrend", "decimate", "run_in", "robust")
+KEYS = ("use", "merge", "noise", "averaged", "delay", "detrend", "decimate", "run_in", "robust")
 
 EVERYTHING = Selection()
 """All rows of every log, as they were measured."""

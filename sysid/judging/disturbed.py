@@ -6,7 +6,7 @@ Jacobians of one run tell what any function in any equation would do.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,8 @@ from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.problem.preparation import at_places
 from sysid.threads import Workers
+
+_FINE = 4  # steps of the integration in a sample, for what is to differ from another run alone
 
 
 @dataclass(eq=False)
@@ -79,6 +81,21 @@ class DisturbedRun:
     def late(self, j: int, delay: float) -> FloatArray:
         """Change (n_samples,) of output j by so many seconds that it comes late."""
         return shifted(self.outputs[:, j], -delay / self.record.dt, False)
+
+    def mean(self, j: int) -> FloatArray:
+        """Change (n_samples,) of output j by being its mean since the sample before, if it is none.
+
+        Raises ModelError where a run in finer steps does not stay finite.
+        """
+        if j in _averaged(self.record):
+            return np.zeros(len(self.outputs))
+        windows = np.zeros((*self.outputs.shape, 2))
+        windows[:, j, 0] = -self.record.dt
+        record = replace(self.record, windows=windows)
+        start, workers = self.start, self.workers
+        run = DisturbedRun.free(self.model, self.vector, record, start, _FINE, workers)
+        change: FloatArray = run.outputs[:, j] - self.outputs[:, j]
+        return change
 
     def over(self, windows: FloatArray) -> FloatArray:
         """The undisturbed outputs over other windows, (n_samples, n_outputs, 2)."""

@@ -72,6 +72,10 @@ class FilteredRun(DisturbedRun):
         windows = self._windows(j)
         return means(signal, windows / self.record.dt) if windows.any() else signal
 
+    def mean(self, j: int) -> FloatArray:
+        """None: a filter's foresight is not that of a free run."""
+        return np.zeros(len(self.outputs))
+
     def late(self, j: int, delay: float) -> FloatArray:
         """Change (n_samples,) of output j by so many seconds that it comes late.
 

@@ -88,6 +88,8 @@ class Finding:
 
 _WORDS = {
     "delay": "{name} is logged {amplitude:.3g} s {late}",
+    "mean": "{name} is logged as its mean over the {amplitude:.3g} s before each sample, as "
+    "differences of positions are, or late by half of that",
     "filter": "{name} is logged through a filter of {amplitude:.3g} s",
     "lag": "{name} acts with a lag of {amplitude:.3g} s",
     "play": "{name} acts through play (hysteresis) of {amplitude:.3g} {unit}",

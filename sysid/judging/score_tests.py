@@ -21,6 +21,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import noiseless
@@ -64,6 +65,8 @@ _FEW = 25  # samples for each amplitude, below which what they leave tells no co
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
 # Change from first to last of what is nowhere below zero, in parts of its mean: 2, 1 for chance.
 _EMPTIED = 3.0
+_LEAST = 1e-6  # error of an output in parts of the largest, below which it weighs no more
+_WHOLE = 0.2  # share by which a mean may seem to be longer or shorter than it is
 _REACH = 10.0  # of a term's range in parts of the size that its test found
 # Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
 # its value, the data want it elsewhere, and nobody knows where.
@@ -218,13 +221,21 @@ class _Tests:
                 surest = min(sized, key=lambda i: float(np.sum(sized[i][2] ** 2)))
                 changes[surest], result, residual = sized[surest]
             suspect = suspects[surest]
+            if suspect.mean is not None:
+                late = changes[surest], result, residual
+                suspect, changes[surest], result, residual = self._as_mean(suspect, *late)
             if suspect.closer is not None:
                 suspect, result, residual = self._closer(suspect, result, residual)
                 changes[surest] = suspect.changes / self._scales[..., None]
             term = self._term(suspect, changes[surest], residual)
             # Of what shape a function is hardly shows, and decides what it moves.
-            shapes = [results[i][0] for i in significant if suspects[i].shares_place(suspect)]
-            self.findings.append(self._finding(suspect, [result, *shapes], logs[surest], term))
+            shapes = [
+                self._moved(changes[i], results[i][0])
+                for i in significant
+                if suspects[i].shares_place(suspect)
+            ]
+            moves = [self._moved(changes[surest], result), *shapes]
+            self.findings.append(self._finding(suspect, result, moves, logs[surest], term))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -310,20 +321,39 @@ class _Tests:
     def _as_late(
         self, suspect: Suspect, result: Regressed, residual: FloatArray
     ) -> tuple[FloatArray, Regressed, FloatArray]:
-        """Changes, test and what is left of a delay as large as explains most of the residuals."""
+        """Changes, test and what is left of a delay as large as explains most of the residuals.
+
+        Changes are per second of those that far, of which a part, or more, may be there.
+        """
         assert suspect.late is not None
         regression = self._coloured_by(residual)
         delays = (float(result.amplitudes[0]) * np.linspace(*_TIMES)).tolist()
-        late = [suspect.late(delay) / self._scales[..., None] for delay in delays]
+        late = [suspect.late(delay) / delay / self._scales[..., None] for delay in delays]
         tests = self._workers.results(lambda each: regression.test(each, suspect.one_sided), late)
         best = None
-        for delay, changes, test in zip(delays, late, tests, strict=True):
+        for changes, test in zip(late, tests, strict=True):
             if test is not None and (best is None or test.share > best[1].share):
-                best = changes, test, delay
+                best = changes, test
         if best is None:
             return suspect.changes / self._scales[..., None], result, residual
-        changes, test, delay = best
-        return changes, replace(test, amplitudes=np.array([delay])), self._left(changes, test)
+        changes, test = best
+        return changes, test, self._left(changes, test)
+
+    def _as_mean(
+        self, suspect: Suspect, changes: FloatArray, result: Regressed, residual: FloatArray
+    ) -> tuple[Suspect, FloatArray, Regressed, FloatArray]:
+        """Of an output that is late the same as a mean, where being whole it explains as much."""
+        assert suspect.mean is not None
+        regression, mean = self._coloured_by(residual), suspect.mean()
+        averaged = mean.changes / self._scales[..., None]
+        late, test = (regression.test(each, False) for each in (changes, averaged))
+        if test is None or (late is not None and test.share < _AS_MUCH * late.share):
+            return suspect, changes, result, residual
+        time = self._local.objective.records[0].dt
+        if abs(float(test.amplitudes[0]) / time - 1.0) > _WHOLE:
+            return suspect, changes, result, residual
+        left = self._left(averaged, test)
+        return mean, averaged, replace(test, amplitudes=np.array([time])), left
 
     def _closer(
         self, suspect: Suspect, result: Regressed, residual: FloatArray
@@ -379,13 +409,45 @@ class _Tests:
         _, size, term = max(alone, key=lambda test: test[0])
         return _with_reach(term, size)
 
+    def _moved(self, changes: FloatArray, result: Regressed) -> FloatArray:
+        """By how much each estimate moves where a fit, by its own weights, has a suspect as well.
+
+        Not by the whitened residuals': these may weigh what the estimate hardly counts.
+        """
+        admitted = slice(self._ends[0], None)
+        taken = changes @ result.amplitudes
+        taken = taken + self._columns[..., admitted] @ result.move[admitted]
+        basis, triangle = self._fitted
+        within = basis[: taken.size].T @ (taken / self._errors).ravel()
+        moved: FloatArray = self._gradients @ -solve_triangular(triangle, within)
+        return moved
+
+    @cached_property
+    def _errors(self) -> FloatArray:
+        """Root mean square of each output's residuals, (n_outputs,), by which a fit weighs."""
+        rms = np.sqrt(np.mean(self._residual**2, axis=0))
+        errors: FloatArray = np.maximum(rms, _LEAST * rms.max())
+        return errors
+
+    @cached_property
+    def _fitted(self) -> tuple[FloatArray, FloatArray]:
+        """QR factors of the slopes as a fit weighs them, above what is known of each beforehand."""
+        count = self._gradients.shape[1]
+        slopes = (self._columns[..., :count] / self._errors[:, None]).reshape(-1, count)
+        basis, triangle = np.linalg.qr(np.vstack([slopes, np.diag(self._free[:count])]))
+        return basis, triangle
+
     def _finding(
-        self, suspect: Suspect, results: Sequence[Regressed], log_p: float, term: AddedTerm | None
+        self,
+        suspect: Suspect,
+        result: Regressed,
+        moves: Sequence[FloatArray],
+        log_p: float,
+        term: AddedTerm | None,
     ) -> Finding:
-        """What a suspect's result finds, the first; moves by whichever result moves farthest."""
-        moves = [self._gradients @ each.move[: self._gradients.shape[1]] for each in results]
+        """Of a suspect by its test, each estimate moved as by whichever moves it farthest."""
         moved = np.array([max(each, key=abs) for each in zip(*moves, strict=True)])
-        several, amplitudes = suspect.kind in _SEVERAL, results[0].amplitudes
+        several, amplitudes = suspect.kind in _SEVERAL, result.amplitudes
         names = [estimate.name for estimate in self._estimates]
         if suspect.kind == "change" and suspect.name in names:
             # Whatever its mean, it is not that value at either end of a record.
@@ -400,7 +462,7 @@ class _Tests:
             suspect.unit,
             None if several else float(amplitudes[0]),
             float(np.exp(min(log_p, 0.0))),
-            results[0].share,
+            result.share,
             tuple(moves_to),
             term,
             suspect.of_input,

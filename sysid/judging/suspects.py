@@ -23,6 +23,7 @@ from sysid.problem.terms import AddedTerm, Shape
 Kind = Literal[
     "variant",
     "delay",
+    "mean",
     "filter",
     "lag",
     "play",
@@ -78,8 +79,9 @@ class Suspect:
     name: of the channel, the variant, or the equation. terms: of functions, one for each amplitude,
     their ranges those of one unit. changes: (n_rows, n_outputs, n_amplitudes), records one after
     another, in the outputs' units. late: of a delay or a filter, the change by so many seconds of
-    it: where outputs jump that by a little is no guide. closer: the same of sizes beside its own,
-    where those that are tested are far apart. of_input: whether a channel is an input.
+    it: where outputs jump that by a little is no guide. of_input: whether a channel is an input.
+    mean: of an output that comes late, what it is as a mean over the time since the sample before.
+    closer: the same of sizes beside its own, where those that are tested are far apart.
     """
 
     kind: Kind
@@ -89,6 +91,7 @@ class Suspect:
     terms: tuple[AddedTerm, ...] = ()
     late: Callable[[float], FloatArray] | None = None
     of_input: bool = False
+    mean: Callable[[], "Suspect"] | None = None
     closer: Callable[[], "Sequence[Suspect]"] | None = None
 
     @property
@@ -120,8 +123,10 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """
     model = runs[0].model
     for j, output in enumerate(model.outputs):
-        yield from _late("delay", output.name, partial(_late_output, runs, j), runs)
-        yield from _late("filter", output.name, partial(_filtered_output, runs, j), runs)
+        mean = partial(_mean_output, runs, j)
+        for kind, is_late in _LATE_OUTPUTS.items():
+            for late in _late(kind, output.name, partial(is_late, runs, j), runs):
+                yield replace(late, mean=mean)
         zeroed = any(run.record.output_zero[j] for run in runs)
         for kind, signal in _faults(partial(_output, j), zeroed):
             changes = _logged(runs, j, signal)[..., None]
@@ -163,6 +168,18 @@ def _filtered_output(runs: Sequence[DisturbedRun], j: int, time: float) -> Float
         return run.averaged(j, smoothed(run.instants[:, j], time / run.record.dt))
 
     return _logged(runs, j, change)[..., None]
+
+
+_LATE_OUTPUTS: dict[Kind, Callable[[Sequence[DisturbedRun], int, float], FloatArray]] = {
+    "delay": _late_output,
+    "filter": _filtered_output,
+}
+
+
+def _mean_output(runs: Sequence[DisturbedRun], j: int) -> Suspect:
+    """An output that is its mean since the sample before, as the difference of two positions is."""
+    changes = _logged(runs, j, lambda run: run.mean(j) / run.record.dt)
+    return Suspect("mean", runs[0].model.outputs[j].name, "s", changes[..., None])
 
 
 def _logged(
@@ -290,7 +307,7 @@ def in_single_records(
             changes[rows] = suspect.changes[rows]
             name = f"{suspect.name} of {run.record.name}"
             late = None if suspect.late is None else partial(_within, rows, suspect.late)
-            yield replace(suspect, name=name, changes=changes, late=late)
+            yield replace(suspect, name=name, changes=changes, late=late, mean=None)
 
 
 def _within(rows: slice, late: Callable[[float], FloatArray], delay: float) -> FloatArray:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.linalg import expm
 
 from daq import identify
 from daq.config.identification import IdentificationConfig
@@ -55,6 +56,7 @@ def test_a_delay_is_added_to_what_is_taken_out_already():
     assert mended([found("delay", "y", 0.00412)]) == ("delay.y=0.00412",)
     late = [found("delay", "u", -0.002)]
     assert mended(late, delay={"u": "5 ms"}) == ("delay.u=0.003",)
+    assert mended([found("mean", "y", 0.002)]) == ("averaged.y=0.002",)
 
 
 def test_starts_on_an_end_are_searched_farther():
@@ -171,6 +173,42 @@ def test_a_wrong_gain_is_fitted_by_the_command_and_stays_a_doubt():
     assert second.verdict.predicted.trust == "good"
     assert second.verdict.parameters.trust == "limited"
     assert any("which channel is wrong" in reason for reason in second.verdict.parameters.reasons)
+
+
+def encoder_log(seed, n=600, dt=0.002, count=2.0 * np.pi / 2000.0):
+    """The same motor in closed form, its speed the difference of two counts of an encoder."""
+    rng, motor = np.random.default_rng(seed), find_model(MOTOR)
+    p = {**dict(zip(motor.parameter_names, motor.nominal, strict=True)), "inertia": 4e-6}
+    slopes = np.zeros((4, 4))  # of current, speed, angle and the voltage that is held
+    slopes[0] = np.array([-p["resistance"], -p["constant"], 0.0, 1.0]) / p["inductance"]
+    slopes[1, :2] = np.array([p["constant"], -p["damping"]]) / p["inertia"]
+    slopes[2, 1] = 1.0
+    step, voltage = expm(slopes * dt), np.repeat(rng.uniform(-1.0, 1.0, n // 10), 10)
+    states = np.zeros((n, 4))
+    for k in range(1, n):
+        states[k] = step @ np.append(states[k - 1, :3], voltage[k - 1])
+    counts = np.floor(states[:, 2] / count)
+    speed = np.diff(counts, prepend=0.0) * count / dt
+    current = states[:, 0] + 0.005 * rng.normal(size=n)
+    columns = {"voltage": voltage, "load": np.zeros(n), "current": current, "omega": speed}
+    return pd.DataFrame({"t": dt * np.arange(n), **columns}), p
+
+
+@pytest.mark.soak
+def test_a_speed_that_is_a_difference_of_positions_is_named_and_right_by_the_command():
+    (log, truth), (check, _) = encoder_log(1), encoder_log(2)
+    fixed = {"damping": truth["damping"]}
+    quick = {"model": MOTOR, "population": 100, "generations": 20, "fixed": fixed}
+    first = identify(log, validate=check, **quick)
+    assert "omega is logged as its mean over the 0.002 s" in " ".join(first.verdict.reasons)
+    assert first.trust != "good"
+    found = first.suspicion.findings
+    setting = remedies(IdentificationConfig(), {"omega": "rad/s"}, findings=found)
+    assert setting == ("averaged.omega=0.002",)
+    second = identify(log, validate=check, averaged={"omega": "2 ms"}, **quick)
+    assert second.trust == "good", second.verdict.reasons
+    for estimate in second.uncertainty.determined():
+        assert not estimate.excludes(truth), estimate
 
 
 @pytest.mark.soak
