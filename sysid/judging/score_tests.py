@@ -5,8 +5,9 @@ change of the outputs by a suspect's amplitudes (see ``suspects``), all whitened
 autoregression, e is regressed on S alone and on S and D together. Of the part of D that no change
 of the parameters makes, r = D - S S+ D, the score r'e is zero in the mean where the suspect is
 not there: its square in units of its covariance is a chi-square (the Lagrange multiplier test;
-Breusch & Pagan, Review of Economic Studies 47, 1980). The difference of the two regressions'
-parameters is the Gauss-Newton step by which the suspect, were it fitted as well, moves them.
+Breusch & Pagan, Review of Economic Studies 47, 1980). What the suspect's amplitudes take out of e,
+regressed on S as a fit weighs it, is the Gauss-Newton step by which the suspect, were it fitted as
+well, moves the parameters.
 
 What is known beforehand keeps the regression from using what is no freedom: a factor of e of each
 parameter, a channel's zero by as much as its calibration left open. The suspect with the smallest
