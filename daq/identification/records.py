@@ -240,8 +240,8 @@ def from_frame(
 
 def _prepared(log: LoggedRecord, model: ProcessModel, selection: Selection) -> LoggedRecord:
     """A log as ``delay``, ``detrend``, ``decimate``, ``run_in`` and ``robust`` want it."""
-    said = selection.with_averages(selection.with_noise(log.dataset, model), model)
-    log = replace(log, dataset=said)
+    dataset = selection.with_averages(selection.with_noise(log.dataset, model), model)
+    log = replace(log, dataset=dataset)
     if selection.preparation.needed:
         made, before = selection.prepared(log.dataset, log.path, model), log.dataset
         steps = (*_merging(log), *made.steps)
