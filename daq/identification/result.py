@@ -617,9 +617,9 @@ def _by_output(estimator: GASSI, noise: FloatArray | None) -> dict[str, float]:
 def _averaged(result: Identification) -> dict[str, str]:
     """Outputs that their sensor averages, and how that is met."""
     records = [log.log.dataset for log in (*result.training, *result.validation)]
-    windows = result.problem.selection.averaged
+    times = result.problem.selection.averaged
     return {
-        name: f"its samples are means over {_window(windows.get(name))}, and so are those of the model"
+        name: f"its samples are means over {_window(times.get(name))}, and so are those of the model"
         for j, name in enumerate(result.model.output_names)
         if any(record.windows.size and record.windows[:, j].any() for record in records)
     }
