@@ -619,7 +619,7 @@ def _averaged(result: Identification) -> dict[str, str]:
     records = [log.log.dataset for log in (*result.training, *result.validation)]
     times = result.problem.selection.averaged
     return {
-        name: f"its samples are means over {_window(times.get(name))}, and so are those of the model"
+        name: f"its samples are means over {_window(times.get(name))}, and so are the model's"
         for j, name in enumerate(result.model.output_names)
         if any(record.windows.size and record.windows[:, j].any() for record in records)
     }
