@@ -251,6 +251,12 @@ def both(*faults: Fault) -> Fault:
     return fault
 
 
+def _averaged(s: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """The mean since the sample before, by the straight line between both."""
+    mean: FloatArray = 0.5 * (s + np.append(s[:1], s[:-1]))
+    return mean
+
+
 def _late(samples: int) -> Change:
     return lambda s, rng: np.concatenate([np.full(samples, s[0]), s[:-samples]])
 
@@ -419,6 +425,7 @@ MORE_DATA = (
         **_IN_LATER_LOGS,
     ),
     _in_data("load off in later logs", each(*LOAD, _moved(0.02)), "of training", **_IN_LATER_LOGS),
+    _in_data("speed as differences of positions", each(*SPEED, _averaged), "mean over"),
     _in_data("speed late, calibrated", each(*SPEED, _late(2)), " late", calibration=1.0),
     _in_data(
         "load half, noise understated", each(*LOAD, _scaled(0.5)), "times what", calibration=1 / 3
@@ -454,7 +461,8 @@ MORE_STRUCTURE = (
     _in_structure("LuGre friction", Plant(bristles=5.0), " omega"),
     _in_structure("stiff LuGre friction", Plant(bristles=100.0), " omega"),
     _in_structure("friction of one direction", Plant(dry(FRICTION, backward=0.5)), "omega"),
-    _in_structure("cogging", Plant(lambda w, a: 0.02 * math.sin(4.0 * a))),
+    _in_structure("cogging", Plant(lambda w, a: 0.02 * math.sin(4.0 * a)), "cogging"),
+    _in_structure("little cogging", Plant(lambda w, a: 0.003 * math.sin(12.0 * a)), "cogging"),
     _in_structure("winding warms up fast", Plant(heating=0.4, warming=0.3), "R changes"),
     _in_structure("inductance saturates", Plant(inductance=lambda i: 1.0 / (1.0 + 0.1 * i * i))),
     _in_structure("brakes from the middle on", Plant(disturbance=lambda t: -0.02 * (t > 0.75))),
