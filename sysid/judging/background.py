@@ -16,12 +16,20 @@ from sysid.arrays import FloatArray
 from sysid.fitting.averages import just_missed
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.means import scatter
+from sysid.fitting.objective import Objective
 from sysid.judging.disturbed import DisturbedRun, of_each
 from sysid.judging.filtered import FilteredRun
-from sysid.judging.suspects import likely_noise
+from sysid.judging.input_noise import quieted
+from sysid.problem.data import Dataset
 from sysid.threads import Workers
 from sysid.uncertainty.colour import record_rows
-from sysid.uncertainty.sensitivity import Sensitivity, input_noises, spans, zero_errors
+from sysid.uncertainty.sensitivity import (
+    Sensitivity,
+    input_noises,
+    sensitivity,
+    spans,
+    zero_errors,
+)
 
 _TINY = 1e-300
 _ITERATIONS = 20  # by which residuals' variances settle
@@ -47,12 +55,28 @@ class Background:
     weights: FloatArray
 
 
-def of_free_runs(local: Sensitivity) -> tuple[Sensitivity, list[DisturbedRun], Background]:
-    """The free runs of residuals and slopes, and what they hold."""
+def quiet_sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
+    """Residuals, and slopes along runs without what is likely to be noise of the inputs.
+
+    Slopes along runs that the noise has moved go with the errors that it makes.
+    """
+    quiet = objective.on([quieted(record) for record in objective.records])
+    local = sensitivity(quiet, chromosome)
+    residual = objective.residuals(chromosome[None], local.steps).values[..., 0]
+    return replace(local, residual=residual)
+
+
+def of_free_runs(
+    local: Sensitivity, records: Sequence[Dataset]
+) -> tuple[Sensitivity, list[DisturbedRun], Background]:
+    """The free runs of residuals and slopes, as of ``quiet_sensitivity``, and what they hold.
+
+    records: as they were measured.
+    """
     objective, chromosomes = local.objective, local.chromosome[None]
     model, vector = objective.simulator.model, objective.space.full(chromosomes)[0]
     workers, runs = Workers(objective.simulator.threads), []
-    for k, record in enumerate(objective.records):
+    for k, record in enumerate(records):
         start = objective.space.starts(chromosomes, k, record.initial_state(model))[0]
         runs.append(DisturbedRun.free(model, vector, record, start, local.steps[k], workers))
     scales, none = objective.scales_of_each, np.zeros(local.residual.shape)
@@ -140,8 +164,7 @@ def _foreseen_noise(runs: Sequence[DisturbedRun]) -> FloatArray:
 def _likely_noise(i: int, run: DisturbedRun) -> FloatArray:
     """What the noise of input i is likely to have done to the outputs, (n_samples, n_outputs)."""
     part = np.zeros(run.record.inputs.shape)
-    deviation, colour = float(run.record.input_noise[i]), float(run.colour[i])
-    part[:, i] = likely_noise(run.record.inputs[:, i], deviation, colour)
+    part[:, i] = run.likely_noise(i)
     return run.driven(part)
 
 
@@ -179,10 +202,11 @@ def _innovations_before(local: Sensitivity) -> FloatArray:
 def _simulation_error(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
     """What a finer integration changes in the outputs, (n_rows, n_outputs, 1); none if little."""
     pieces = []
+    residual = local.objective.residuals(local.chromosome[None], local.steps).values[..., 0]
     for run, rows, scale in zip(
         runs, record_rows(local.lengths), local.objective.scales, strict=True
     ):
-        left = local.residual[rows] * scale
+        left = residual[rows] * scale
         coarse = np.where(local.seen[rows], run.record.outputs + left, run.outputs)
         pieces.append(run.outputs - coarse)
     error = np.concatenate(pieces)[..., None]

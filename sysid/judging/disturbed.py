@@ -17,18 +17,22 @@ from sysid.engine.linear_response import LinearResponse, feedthrough, free_respo
 from sysid.engine.trace import rates_along
 from sysid.engine.windows import average, with_integrals
 from sysid.fitting.reactions import with_reactions
+from sysid.judging.input_noise import likely_noise, not_following, quieted
 from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.problem.preparation import at_places
 from sysid.threads import Workers
 
 _FINE = 4  # steps of the integration in a sample, for what is to differ from another run alone
+_FELT = 1e-3  # part of an output's motion that inputs without noise do at least, or it is none
 
 
 @dataclass(eq=False)
 class DisturbedRun:
     """A free run of a record under parameters (n_parameters,), and what disturbances change.
 
+    It is driven by what of the inputs is not likely to be their noise, so that what it shows moves
+    by nothing that errors go with. measured: (n_samples, n_inputs), the inputs with that noise.
     start: (n_states,), where it begins; response: along it. states: (n_samples, n_states) and
     outputs: (n_samples, n_outputs) of the undisturbed run, these over the record's windows. rates:
     (n_samples, n_states), its f(x, u, p). colour: (n_inputs,), part of the inputs' noise that goes
@@ -38,6 +42,7 @@ class DisturbedRun:
     model: ProcessModel
     vector: FloatArray
     record: Dataset
+    measured: FloatArray
     start: FloatArray
     response: LinearResponse
     colour: FloatArray
@@ -53,16 +58,17 @@ class DisturbedRun:
         n_steps: int,
         workers: Workers,
     ) -> "DisturbedRun":
-        """A free run; n_steps: of the integration in a sample, as of ``free_response``.
+        """A free run of what was measured; n_steps: in a sample, as of ``free_response``.
 
         Raises ModelError where it does not stay finite.
         """
+        measured, record = record.inputs, quieted(record)
         averaged = _averaged(record)
         whole = with_integrals(model, averaged) if averaged else model
         begin = np.append(start, np.zeros(len(averaged)))
         response = free_response(whole, vector, record.inputs, record.dt, n_steps, begin)
         white = np.zeros(record.inputs.shape[1])
-        return cls(model, vector, record, start, response, white, workers)
+        return cls(model, vector, record, measured, start, response, white, workers)
 
     def __post_init__(self) -> None:
         self.states = self.response.states[:, : len(self.model.states)]
@@ -91,7 +97,7 @@ class DisturbedRun:
             return np.zeros(len(self.outputs))
         windows = np.zeros((*self.outputs.shape, 2))
         windows[:, j, 0] = -self.record.dt
-        record = replace(self.record, windows=windows)
+        record = replace(self.record, inputs=self.measured, windows=windows)
         start, workers = self.start, self.workers
         run = DisturbedRun.free(self.model, self.vector, record, start, _FINE, workers)
         change: FloatArray = run.outputs[:, j] - self.outputs[:, j]
@@ -115,6 +121,20 @@ class DisturbedRun:
         """Change of the outputs per unit of a change of the inputs, (n_samples, n_inputs)."""
         outputs = np.einsum("kji,ki->kj", self._feedthrough, inputs)
         return self._change(self.response.of(inputs=inputs, outputs=outputs))
+
+    def likely_noise(self, i: int) -> FloatArray:
+        """What of input i is likely to be noise, (n_samples,): nothing that follows the motion.
+
+        Of a signal below its noise much is taken for noise, which what is tested may go with. Such
+        a signal follows what inputs without noise do.
+        """
+        signal, noisy = self.measured[:, i], self.record.input_noise > 0.0
+        if np.ptp(self.record.inputs[:, ~noisy], axis=0).any():
+            moving = np.where(noisy, self.record.inputs - self.record.inputs.mean(axis=0), 0.0)
+            without = self.outputs - self.driven(moving)
+            felt = without.std(axis=0) > _FELT * self.outputs.std(axis=0)
+            signal = not_following(signal, without[:, felt])
+        return likely_noise(signal, float(self.record.input_noise[i]))
 
     def logged(self, outputs: FloatArray) -> FloatArray:
         """Change by what is logged of the outputs beside what they are: that itself."""

@@ -16,6 +16,7 @@ from sysid.engine.linear_response import LinearResponse, observed, slope_of
 from sysid.engine.windows import average
 from sysid.fitting.innovations import Innovations
 from sysid.judging.disturbed import DisturbedRun, shifted
+from sysid.judging.input_noise import likely_noise
 from sysid.threads import Workers
 
 _SMALL = 1e-6  # part of the parameters by which slopes of the outputs over them are told
@@ -48,6 +49,7 @@ class FilteredRun(DisturbedRun):
             model,
             objective.space.full(chromosome[None])[0],
             record,
+            record.inputs,
             record.initial_state(model),
             response,
             objective.colour[place],
@@ -90,6 +92,11 @@ class FilteredRun(DisturbedRun):
     def _windows(self, j: int) -> FloatArray:
         """Windows of output j, (n_samples, 2); none where all are sampled at their instants."""
         return self.record.windows[:, j] if self.record.windows.size else np.zeros(0)
+
+    def likely_noise(self, i: int) -> FloatArray:
+        """What of input i is likely to be noise, (n_samples,)."""
+        deviation = float(self.record.input_noise[i])
+        return likely_noise(self.measured[:, i], deviation, float(self.colour[i]))
 
     def logged(self, outputs: FloatArray) -> FloatArray:
         """Change by what is logged of the outputs beside what was foreseen, (n_samples, ...)."""

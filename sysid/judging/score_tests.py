@@ -15,7 +15,7 @@ probability is taken into the regression, and the rest asked again.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -28,7 +28,7 @@ from sysid.arrays import FloatArray
 from sysid.fitting.free_run import noiseless
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
-from sysid.judging.background import Background, of_filter, of_free_runs
+from sysid.judging.background import Background, of_filter, of_free_runs, quiet_sensitivity
 from sysid.judging.cycles import cycle_suspects
 from sysid.judging.findings import Finding, Move, moves_of
 from sysid.judging.regression import Regressed, Regression
@@ -61,6 +61,7 @@ _SLOW = ("delay", "filter", "lag")
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
+_AS_LATE = 0.8  # of what one explains that is early, that counts for as much where it is late
 _LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
 _FEW = 25  # samples for each amplitude, below which what they leave tells no colour
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
@@ -96,12 +97,14 @@ class ScoreTests:
         records = head(objective.records, _MOST_SAMPLES)
         filtered = isinstance(objective, Innovations) and objective.quiet
         tested = objective if filtered else objective.free_run
-        local = sensitivity(tested.on(records), chromosome)
+        slopes = sensitivity if filtered else quiet_sensitivity
+        local = slopes(tested.on(records), chromosome)
         left = np.sqrt(np.mean(local.residual**2, axis=0))
         self._exact = not filtered and noiseless(local.objective, chromosome, left)
         if self._exact:
             return
-        local, runs, background = (of_filter if filtered else of_free_runs)(local)
+        held = of_filter(local) if filtered else of_free_runs(local, records)
+        local, runs, background = held
         self._runs, self._tests = runs, _Tests(local, background, runs[0].workers)
         noisy = [runs[0].model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
         channels = list(channel_suspects(runs))
@@ -207,10 +210,7 @@ class _Tests:
             significant = [i for i in likely if self._is_possible(suspects[i], results[i][0])]
             if not significant:
                 return
-            # Of probabilities too small for a number what explains more decides.
-            alike = [i for i in significant if logs[i] == min(logs.values())]
-            enough = _AS_MUCH * max(results[i][0].share for i in alike)
-            surest = next(i for i in alike if results[i][0].share >= enough)
+            surest = _surest(suspects, {i: (logs[i], results[i][0]) for i in significant})
             result, residual = results[surest]
             if suspects[surest].late is not None:
                 # A delay, a filter and a lag of a little are one; of more they are not.
@@ -473,6 +473,27 @@ class _Tests:
         low, high = self._limits.get(move.quantity.name, (-np.inf, np.inf))
         value = move.quantity.value
         return replace(move, change=float(np.clip(move.change, low - value, high - value)))
+
+
+def _surest(suspects: Sequence[Suspect], tests: Mapping[int, tuple[float, Regressed]]) -> int:
+    """Place of the surest of suspects, by logarithms of their probabilities and their tests.
+
+    Of probabilities too small for a number what explains more decides. Nothing is logged before it
+    happens: what comes late is surer than what would have to be early by about as much.
+    """
+    surest = min(log_p for log_p, _ in tests.values())
+    alike = [i for i, (log_p, _) in tests.items() if log_p == surest]
+    enough = _AS_MUCH * max(tests[i][1].share for i in alike)
+    first = next(i for i in alike if tests[i][1].share >= enough)
+    if not (suspects[first].kind == "delay" and tests[first][1].amplitudes[0] < 0.0):
+        return first
+    enough = _AS_LATE * tests[first][1].share
+    late = [
+        i
+        for i, (_, test) in tests.items()
+        if suspects[i].kind == "delay" and test.amplitudes[0] > 0.0 and test.share >= enough
+    ]
+    return min([first, *late], key=lambda i: (i == first, tests[i][0]))
 
 
 def _of_phase(sine: AddedTerm, amplitudes: FloatArray) -> AddedTerm:

@@ -14,6 +14,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.judging.disturbed import DisturbedRun, of_each, shifted
+from sysid.judging.input_noise import likely_noise, standing_out
 from sysid.linear.polynomials import all_pole
 from sysid.problem.channels import noise
 from sysid.problem.data import Dataset
@@ -55,7 +56,6 @@ _PLAYS = (0.02, 0.1)  # parts of an input's peak
 _STEP, _STANDS, _RISING = 4.5, 5, 2.0
 _RECORD = 0.1  # of a record, beyond which no delay is tested
 _PROBE = 1e-3  # part of a parameter that tells how rates follow it
-_CLEAR = 3.0  # times the noise's power at a frequency, as chance makes in one of twenty
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
 # How a parameter may change with the size, up to 1, of what it multiplies: with it, with its
 # square, and near its zero.
@@ -271,7 +271,7 @@ def _acting(run: DisturbedRun, i: int) -> FloatArray:
     How the noise would be shifted seems to tell a delay far better than the signal does, and what
     it does by its second power, next to nothing, to be one.
     """
-    signal, deviation = run.record.inputs[:, i], float(run.record.input_noise[i])
+    signal, deviation = run.measured[:, i], float(run.record.input_noise[i])
     return standing_out(signal, deviation, float(run.colour[i])) if deviation else signal
 
 
@@ -315,58 +315,6 @@ def _within(rows: slice, late: Callable[[float], FloatArray], delay: float) -> F
     part = np.zeros_like(whole)
     part[rows] = whole[rows]
     return part
-
-
-def likely_noise(signal: FloatArray, deviation: float, colour: float = 0.0) -> FloatArray:
-    """What of a signal (n,) is likely to be its noise of this deviation: Wiener's filter.
-
-    colour: part of the noise that goes on from sample to sample; none of white noise.
-
-    >>> rng = np.random.default_rng(0)
-    >>> noise = 0.1 * rng.standard_normal(1000)
-    >>> likely = likely_noise(np.sin(0.01 * np.arange(1000)) + noise, 0.1)
-    >>> bool(np.corrcoef(likely, noise)[0, 1] > 0.9)
-    True
-    """
-    n = len(signal)
-    spectrum = np.fft.rfft(signal - signal.mean())
-    power = np.abs(spectrum) ** 2 / n
-    width = max(int(np.sqrt(len(power))) // 2, 1)
-    padded = np.pad(power, width, mode="reflect") if len(power) > width else power
-    kernel = np.ones(2 * width + 1) / (2 * width + 1)
-    smooth = np.convolve(padded, kernel, "valid") if len(padded) > len(power) else power
-    share = np.minimum(_noise_power(n, deviation, colour) / np.maximum(smooth, 1e-300), 1.0)
-    likely: FloatArray = np.fft.irfft(spectrum * share, n)
-    return likely
-
-
-def standing_out(signal: FloatArray, deviation: float, colour: float = 0.0) -> FloatArray:
-    """What of a signal (n,) is not likely to be its noise at frequencies where it stands out of it.
-
-    What a Wiener filter keeps between the lines of a signal's spectrum is noise, which drives a
-    free run as well: shifted, it goes with the errors that it makes there. Arguments as of
-    ``likely_noise``.
-
-    >>> rng = np.random.default_rng(0)
-    >>> noise, wave = 0.5 * rng.standard_normal(1000), np.sin(0.02 * np.pi * np.arange(1000))
-    >>> bool(standing_out(noise, 0.5).std() < 0.1)
-    True
-    >>> bool((standing_out(wave + noise, 0.5) - wave).std() < 0.1)
-    True
-    """
-    n, mean = len(signal), signal.mean()
-    power = np.abs(np.fft.rfft(signal - mean)) ** 2 / n
-    clear = power > _CLEAR * _noise_power(n, deviation, colour)
-    kept = np.fft.rfft(signal - likely_noise(signal, deviation, colour) - mean)
-    standing: FloatArray = mean + np.fft.irfft(np.where(clear, kept, 0.0), n)
-    return standing
-
-
-def _noise_power(n: int, deviation: float, colour: float) -> FloatArray:
-    """Of noise in n samples, at each frequency of their spectrum."""
-    turn = np.exp(-2j * np.pi * np.arange(n // 2 + 1) / n)
-    power: FloatArray = deviation**2 * (1.0 - colour**2) / np.abs(1.0 - colour * turn) ** 2
-    return power
 
 
 def _shown_noise(signal: FloatArray, deviation: float) -> FloatArray:
