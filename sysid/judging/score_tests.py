@@ -68,6 +68,7 @@ _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one t
 # Change from first to last of what is nowhere below zero, in parts of its mean: 2, 1 for chance.
 _EMPTIED = 3.0
 _LEAST = 1e-6  # error of an output in parts of the largest, below which it weighs no more
+_FLAT = 0.999  # of what the best size of a delay explains, that is as good
 _WHOLE = 0.2  # share by which a mean may seem to be longer or shorter than it is
 _REACH = 10.0  # of a term's range in parts of the size that its test found
 # Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
@@ -324,21 +325,27 @@ class _Tests:
     ) -> tuple[FloatArray, Regressed, FloatArray]:
         """Changes, test and what is left of a delay as large as explains most of the residuals.
 
-        Changes are per second of those that far, of which a part, or more, may be there.
+        Of sizes that explain about as much that of which no more and no less than all is there.
         """
         assert suspect.late is not None
         regression = self._coloured_by(residual)
         delays = (float(result.amplitudes[0]) * np.linspace(*_TIMES)).tolist()
-        late = [suspect.late(delay) / delay / self._scales[..., None] for delay in delays]
+        late = [suspect.late(delay) / self._scales[..., None] for delay in delays]
         tests = self._workers.results(lambda each: regression.test(each, suspect.one_sided), late)
-        best = None
-        for changes, test in zip(late, tests, strict=True):
-            if test is not None and (best is None or test.share > best[1].share):
-                best = changes, test
-        if best is None:
+        sizes = [
+            (delay, changes, test)
+            for delay, changes, test in zip(delays, late, tests, strict=True)
+            if test is not None
+        ]
+        if not sizes:
             return suspect.changes / self._scales[..., None], result, residual
-        changes, test = best
-        return changes, test, self._left(changes, test)
+        enough = _FLAT * max(test.share for _, _, test in sizes)
+        alike = [each for each in sizes if each[2].share >= enough]
+        delay, changes, test = min(alike, key=lambda each: abs(float(each[2].amplitudes[0]) - 1.0))
+        left = self._left(changes, test)
+        # By the second, so that the amplitude is the delay.
+        changes = changes * test.amplitudes / delay
+        return changes, replace(test, amplitudes=np.array([delay])), left
 
     def _as_mean(
         self, suspect: Suspect, changes: FloatArray, result: Regressed, residual: FloatArray

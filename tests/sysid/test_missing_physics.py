@@ -45,7 +45,7 @@ CASES = {case.name: case for case in cases()}
         [
             ("sign of the current", "current has the opposite sign"),
             ("load half", "load is 1.9"),
-            ("speed through a filter", "omega is logged through a filter of 0.007"),
+            ("speed through a filter", "omega is logged through a filter of 0.008"),
             ("load ten samples late", "load is logged 0.02"),
             ("Coulomb friction", "a term in the sign of omega in domega/dt, like dry friction"),
             ("drag", "a term in omega (square) in domega/dt"),
