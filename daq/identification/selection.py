@@ -64,17 +64,8 @@ class Selection:
         content = {} if self.file is None else self.file.content
         return {key: content[key] for key in KEYS if content.get(key)}
 
-    def check_channels(self, models: Sequence[ProcessModel], plain: Sequence[ProcessModel]) -> None:
-        """Raise ConfigError for a channel that is named and that no model has.
-
-        plain: the models before anything was added to them, any of whose states may be an output.
-        """
-        inputs, outputs = (
-            list(dict.fromkeys(name for m in models for name in getattr(m, key)))
-            for key in ("input_names", "output_names")
-        )
-        signals = [name for m in plain for name in (*m.output_names, *m.state_names)]
-        channels = list(dict.fromkeys([*inputs, *signals]))
+    def check_channels(self, channels: Sequence[str], outputs: Sequence[str]) -> None:
+        """Raise ConfigError for a channel, or an output, that is named and that no model has."""
         named = {
             "noise": (self.noise, channels, "channel"),
             "averaged": (self.averaged, outputs, "output"),

@@ -143,7 +143,12 @@ def problems_of(
     mapping = ColumnMapping(file, settings.columns) if settings.columns else None
     signals = [name for m in plain for name in (*m.output_names, *m.state_names)]
     spare = {"inputs": _all_names(models, "input_names"), "outputs": signals}
-    attempt(lambda: selection.check_channels(models, plain), None)
+    attempt(
+        lambda: selection.check_channels(
+            list(dict.fromkeys([*spare["inputs"], *signals])), _all_names(models, "output_names")
+        ),
+        None,
+    )
     # Typed names are relative to where they are typed, those in a file to that file.
     beside = config.parent if config is not None and "datasheet" not in file.typed else Path()
     sheets = [beside / name for name in settings.datasheet]

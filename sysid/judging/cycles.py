@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.judging.disturbed import DisturbedRun
-from sysid.judging.suspects import Suspect, of_terms, physical_equations
+from sysid.judging.suspects import Suspect, of_terms, only, physical_equations, rows_of
 from sysid.problem.terms import AddedTerm
 
 _MOST_CYCLES = 40  # within the range of a position, or in a turn
@@ -89,12 +89,8 @@ def _cycle(runs: Sequence[DisturbedRun], way: _Way, period: float) -> Suspect:
 
 def _by_record(suspect: Suspect, runs: Sequence[DisturbedRun]) -> Suspect:
     """The same with amplitudes of their own in every record."""
-    lengths = [run.record.n_samples for run in runs]
-    record = np.repeat(np.arange(len(runs)), lengths)[:, None, None]
-    changes = [np.where(record == k, suspect.changes, 0.0) for k in range(len(runs))]
-    return replace(
-        suspect, changes=np.concatenate(changes, axis=2), terms=suspect.terms * len(runs)
-    )
+    changes = np.concatenate([only(rows, suspect.changes) for rows in rows_of(runs)], axis=2)
+    return replace(suspect, changes=changes, terms=suspect.terms * len(runs))
 
 
 def _ways(runs: Sequence[DisturbedRun]) -> Iterator[_Way]:

@@ -234,7 +234,7 @@ class _Tests:
             shapes = [
                 self._moved(changes[i], results[i][0])
                 for i in significant
-                if suspects[i].shares_place(suspect)
+                if i != surest and suspects[i].shares_place(suspect)
             ]
             moves = [self._moved(changes[surest], result), *shapes]
             self.findings.append(self._finding(suspect, result, moves, logs[surest], term))

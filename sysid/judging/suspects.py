@@ -20,6 +20,7 @@ from sysid.problem.channels import noise
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ProcessModel, State
 from sysid.problem.terms import AddedTerm, Shape
+from sysid.uncertainty.colour import record_rows
 
 Kind = Literal[
     "variant",
@@ -299,21 +300,27 @@ def in_single_records(
     """Faults of channels as they would be in one of several records alone."""
     if len(runs) == 1:
         return
-    ends = np.cumsum([run.record.n_samples for run in runs])
-    for run, end in zip(runs, ends.tolist(), strict=True):
-        rows = slice(end - run.record.n_samples, end)
+    for run, rows in zip(runs, rows_of(runs), strict=True):
         for suspect in suspects:
-            changes = np.zeros_like(suspect.changes)
-            changes[rows] = suspect.changes[rows]
+            changes = only(rows, suspect.changes)
             name = f"{suspect.name} of {run.record.name}"
             late = None if suspect.late is None else partial(_within, rows, suspect.late)
             yield replace(suspect, name=name, changes=changes, late=late, mean=None)
 
 
 def _within(rows: slice, late: Callable[[float], FloatArray], delay: float) -> FloatArray:
-    whole = late(delay)
-    part = np.zeros_like(whole)
-    part[rows] = whole[rows]
+    return only(rows, late(delay))
+
+
+def rows_of(runs: Sequence[DisturbedRun]) -> list[slice]:
+    """Where each record stands in the changes of all."""
+    return record_rows([run.record.n_samples for run in runs])
+
+
+def only(rows: slice, changes: FloatArray) -> FloatArray:
+    """Changes at some rows, and none elsewhere."""
+    part = np.zeros_like(changes)
+    part[rows] = changes[rows]
     return part
 
 

@@ -26,6 +26,17 @@ from tests.daq.support import OF_LAG, rig
 GAIN, TAU, DT, N = 3.0, 0.04, 1e-3, 3000
 
 
+def between_levels(count, hold):
+    """A table of the lag thrown between two levels, each held for so many samples, with noise."""
+    rng = np.random.default_rng(0)
+    inputs = np.repeat(rng.choice([-1.0, 1.0], count), hold)
+    outputs = np.zeros(len(inputs))
+    for k, u in enumerate(inputs[:-1]):
+        outputs[k + 1] = GAIN * u + (outputs[k] - GAIN * u) * np.exp(-DT / TAU)
+    outputs[1:] += 0.01 * rng.standard_normal(len(outputs) - 1)
+    return pd.DataFrame({"t": DT * np.arange(len(inputs)), "u": inputs, "y": outputs})
+
+
 def clean():
     """A lag at 1 kHz under levels that hold for 23 samples, without noise."""
     u = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, N // 23 + 1), 23)[:N]
@@ -153,14 +164,7 @@ def test_a_log_is_merged_moved_cut_and_decimated_and_the_report_shows_it(folder)
 
 
 def test_a_long_log_is_searched_by_parts_and_that_is_told(folder):
-    rng = np.random.default_rng(0)
-    inputs = np.repeat(rng.choice([-1.0, 1.0], 400), 20)
-    outputs = np.zeros(len(inputs))
-    for k, u in enumerate(inputs[:-1]):
-        outputs[k + 1] = GAIN * u + (outputs[k] - GAIN * u) * np.exp(-DT / TAU)
-    outputs[1:] += 0.01 * rng.standard_normal(len(outputs) - 1)
-    table = pd.DataFrame({"t": DT * np.arange(len(inputs)), "u": inputs, "y": outputs})
-    table.to_csv(folder / "long.csv", index=False)
+    between_levels(400, 20).to_csv(folder / "long.csv", index=False)
     problem(folder, search_samples=2048)
     request = SettingsRequest(str(folder / "id.yaml"))
     result = identify_files([folder / "long.csv"], [], request, folder / "out", lambda _: None)
@@ -215,14 +219,7 @@ def test_a_gap_is_cut_out_by_the_setting_that_is_named_for_it(folder):
 
 def test_what_is_wrong_with_a_log_is_told_of_it_as_logged(folder):
     """A low-pass rings beside levels, which looks like clipping, and closes short gaps."""
-    rng = np.random.default_rng(0)
-    inputs = np.repeat(rng.choice([-1.0, 1.0], 150), 40)
-    outputs = np.zeros(len(inputs))
-    for k, u in enumerate(inputs[:-1]):
-        outputs[k + 1] = GAIN * u + (outputs[k] - GAIN * u) * np.exp(-DT / TAU)
-    outputs += 0.01 * rng.standard_normal(len(outputs))
-    table = pd.DataFrame({"t": DT * np.arange(len(inputs)), "u": inputs, "y": outputs})
-    table.drop(index=range(3000, 3030)).to_csv(folder / "day1.csv", index=False)
+    between_levels(150, 40).drop(index=range(3000, 3030)).to_csv(folder / "day1.csv", index=False)
     problem(folder, decimate=4)
     request = SettingsRequest(str(folder / "id.yaml"))
     result = identify_files([folder / "day1.csv"], [], request, folder / "out", lambda _: None)
