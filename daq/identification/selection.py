@@ -18,6 +18,8 @@ from sysid.problem.data import Dataset
 from sysid.problem.model import ProcessModel
 from sysid.problem.preparation import AS_IT_IS, Preparation, PreparationError, Prepared, prepare
 
+_LONGEST_MEAN = 0.1  # of what is used of a log
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -104,9 +106,15 @@ class Selection:
         return replace(record, input_noise=inputs, output_noise=outputs)
 
     def with_averages(self, record: Dataset, model: ProcessModel) -> Dataset:
-        """A record with the windows of its outputs as said here."""
+        """A record with the windows of its outputs as said here; ConfigError for absurd ones."""
         if not self.averaged:
             return record
+        whole = record.n_samples * record.dt
+        for name, time in self.averaged.items():
+            if time > _LONGEST_MEAN * whole:
+                problem = f"{time:g} s is more than a tenth of {record.name}, {whole:.3g} s"
+                cure = "give the time between two samples; a number without a unit is in seconds"
+                raise self._mistaken(("averaged", name), problem, cure)
         shape = (*record.outputs.shape, 2)
         windows = record.windows.copy() if record.windows.size else np.zeros(shape)
         for j, name in enumerate(model.output_names):

@@ -69,6 +69,7 @@ _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one t
 _EMPTIED = 3.0
 _LEAST = 1e-6  # error of an output in parts of the largest, below which it weighs no more
 _FLAT = 0.999  # of what the best size of a delay explains, that is as good
+_SAME_RATE = 1e-3  # of a sample time
 _WHOLE = 0.2  # share by which a mean may seem to be longer or shorter than it is
 _REACH = 10.0  # of a term's range in parts of the size that its test found
 # Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
@@ -357,8 +358,11 @@ class _Tests:
         late, test = (regression.test(each, False) for each in (changes, averaged))
         if test is None or (late is not None and test.share < _AS_MUCH * late.share):
             return suspect, changes, result, residual
-        time = self._local.objective.records[0].dt
-        if abs(float(test.amplitudes[0]) / time - 1.0) > _WHOLE:
+        times = [record.dt for record in self._local.objective.records]
+        time = times[0]
+        # Of logs of several rates no one time is that since the sample before.
+        alike = np.allclose(times, time, rtol=_SAME_RATE)
+        if not alike or abs(float(test.amplitudes[0]) / time - 1.0) > _WHOLE:
             return suspect, changes, result, residual
         left = self._left(averaged, test)
         return mean, averaged, replace(test, amplitudes=np.array([time])), left

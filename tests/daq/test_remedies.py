@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from daq import identify
 from daq.config.identification import IdentificationConfig
+from daq.errors import ConfigError
 from daq.identification.remedies import remedies
 from daq.lookup.models import find_model
 from sysid import BatchSimulator, Dataset
@@ -209,6 +210,21 @@ def test_a_speed_that_is_a_difference_of_positions_is_named_and_right_by_the_com
     assert second.trust == "good", second.verdict.reasons
     for estimate in second.uncertainty.determined():
         assert not estimate.excludes(truth), estimate
+
+
+def test_a_mean_over_more_than_a_tenth_of_a_log_is_refused():
+    """A unit was forgotten: 2 for 2 ms."""
+    with pytest.raises(ConfigError, match=r"averaged\.omega: 2 s is more than a tenth of .*1\.2 s"):
+        identify(encoder_log(1)[0], model=MOTOR, averaged={"omega": 2})
+
+
+@pytest.mark.soak
+def test_of_logs_of_several_rates_no_single_mean_is_named():
+    fixed = {"damping": 1.33e-5}
+    quick = {"model": MOTOR, "population": 100, "generations": 20, "fixed": fixed}
+    logs = encoder_log(1)[0], encoder_log(2, dt=0.004)[0]
+    kinds = {finding.kind for finding in identify([*logs], **quick).suspicion.findings}
+    assert "mean" not in kinds and kinds & {"delay", "filter"}
 
 
 @pytest.mark.soak
