@@ -105,10 +105,15 @@ def _changes(
     added: FloatArray,
     first: FloatArray,
 ) -> FloatArray:
-    """Changes (n_samples, n_outputs) by deviations that begin at ``first``, (m,)."""
+    """Changes (n_samples, n_outputs) by deviations that begin at ``first``, (m,).
+
+    Copied in loops: assignments of whole arrays take the compiler three seconds.
+    """
     n, q, m = rows.shape
     changes = np.empty((n, q))
-    d, moved = first.copy(), np.empty(m)
+    d, moved = np.empty(m), np.empty(m)
+    for a in range(m):
+        d[a] = first[a]
     for k in range(n):
         for j in range(q):
             e = added[k, j]
@@ -117,11 +122,13 @@ def _changes(
             for a in range(m):
                 d[a] -= gains[k, j, a] * e
             changes[k, j] = e
-        moved[:] = pushes[k]
+        for a in range(m):
+            moved[a] = pushes[k, a]
         for b in range(m):
             for a in range(m):
                 moved[a] += onward[k, b, a] * d[b]
-        d[:] = moved
+        for a in range(m):
+            d[a] = moved[a]
     return changes
 
 
