@@ -352,7 +352,8 @@ def examined(
 
     watch(Progress("Verdict", 0, 1, "what the model may lack"))
     training, validation = ([log.dataset for log in part] for part in logs)
-    suspicion = suspected(result.estimator, result.uncertainty, training, validation, missing)
+    runs = [fitted.run for fitted in result.training]
+    suspicion = suspected(result.estimator, result.uncertainty, training, validation, missing, runs)
     watch(Progress("Verdict", 1, 1, "what the model may lack"))
     return replace(result, suspicion=suspicion)
 

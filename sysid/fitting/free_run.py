@@ -60,9 +60,9 @@ class AccurateRun:
     @classmethod
     def of(cls, simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> Self:
         """As ``free_run``."""
-        accuracy = simulator.accuracy
+        accuracy, start = simulator.accuracy, None
         while True:
-            start = estimate_start(simulator, vector, record)
+            start = estimate_start(simulator, vector, record, start)
             steps = int(simulator.steps_of_each(vector, record, start[None]).max())
             few, many = (
                 simulator.trajectories(vector, record, n, start[None])[0]
@@ -152,11 +152,16 @@ def _change_by_steps(objective: Objective, chromosome: FloatArray, steps: IntArr
     return change
 
 
-def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Dataset) -> FloatArray:
+def estimate_start(
+    simulator: BatchSimulator,
+    vector: FloatArray,
+    record: Dataset,
+    near: FloatArray | None = None,
+) -> FloatArray:
     """Initial states (n_states,) of a record under parameters (n_parameters,).
 
     States with an ``initial_range`` are fitted to the measured outputs by least squares, of a long
-    record to its beginning.
+    record to its beginning. near: (n_states,), where to look first, as of a coarser simulation.
     """
     model = simulator.model
     declared = record.initial_state(model)
@@ -166,6 +171,9 @@ def estimate_start(simulator: BatchSimulator, vector: FloatArray, record: Datase
     if not (space.estimated and weights.any()):
         return declared
     objective = Objective(simulator, space, [head], weights=weights)
-    fitted = refine(objective, space.with_nominal_starts(np.empty(0))).chromosome
+    begin = space.with_nominal_starts(np.empty(0))
+    if near is not None:
+        begin = near[[state for _, state in space.estimated]]
+    fitted = refine(objective, begin).chromosome
     start: FloatArray = space.starts(fitted[None], 0, declared)[0]
     return start

@@ -55,14 +55,15 @@ def verdict_of(
     if estimator.is_refined_ and uncertainty is None:
         uncertainty = estimator.uncertainty(list(training))
     trained, validated = (
-        [examined(estimator, record, uncertainty)[1] for record in part]
+        [examined(estimator, record, uncertainty) for record in part]
         for part in (training, validation)
     )
-    suspicion = suspected(estimator, uncertainty, training, validation)
+    runs = [run for run, _ in trained]
+    suspicion = suspected(estimator, uncertainty, training, validation, runs=runs)
     return judge(
         estimator.simulator().model,
-        trained,
-        validated,
+        [result for _, result in trained],
+        [result for _, result in validated],
         uncertainty,
         estimator.feasible_,
         faults=(
@@ -105,17 +106,19 @@ def suspected(
     training: Sequence[Dataset],
     validation: Sequence[Dataset] = (),
     missing: Callable[[Uncertainty], tuple[Finding, ...]] | None = None,
+    runs: Sequence[FloatArray] | None = None,
 ) -> Suspicion | None:
     """What the model may lack by the training records; None where that cannot be tested.
 
     By free runs, or innovations where noise of the inputs moves these so far that a filter averages
     it; not where equations bend over what is left of it, since a filter does not see that.
     validation: on which a variant that is fitted must do no worse. missing: the findings of
-    ``score_tests_of``, where these have been begun elsewhere.
+    ``score_tests_of``, where these have been begun elsewhere. runs: of ``examined`` on each
+    training record, where they are at hand.
     """
     if uncertainty is None:
         return None
-    exchange = exchanged_channels(estimator, uncertainty, training)
+    exchange = exchanged_channels(estimator, uncertainty, training, runs)
     if exchange is not None:
         return Suspicion((exchange,), None)  # what else is found is of the wrong channels
     if estimator.averaged_inputs_ and np.any(uncertainty.bent > MISJUDGED):

@@ -38,10 +38,17 @@ Side = Literal["inputs", "outputs"]
 
 
 def exchanged_channels(
-    estimator: GASSI, uncertainty: Uncertainty, training: Sequence[Dataset]
+    estimator: GASSI,
+    uncertainty: Uncertainty,
+    training: Sequence[Dataset],
+    runs: Sequence[FloatArray] | None = None,
 ) -> Finding | None:
-    """The pair of channels that training records have exchanged, if there is one."""
-    left = [record.outputs - estimator.predict(record) for record in training]
+    """The pair of channels that training records have exchanged, if there is one.
+
+    runs: what the estimator predicts of each of them, where that is at hand.
+    """
+    runs = runs or [estimator.predict(record) for record in training]
+    left = [record.outputs - run for record, run in zip(training, runs, strict=True)]
     best = None
     for side, i, j in _pairs(estimator, training, left):
         pair = _signals(estimator, side)[i].name, _signals(estimator, side)[j].name
