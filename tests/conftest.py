@@ -1,6 +1,8 @@
 """What holds for every test."""
 
+import contextlib
 import gc
+import importlib
 import os
 import signal
 import sys
@@ -27,6 +29,8 @@ def pytest_configure(config):
         folder = cache.mkdir("kernels") if cache else tempfile.mkdtemp(prefix="kernels-")
         Path(folder).chmod(0o700)  # whatever the umask: a folder that others write to is refused
         os.environ["RIG_CACHE_DIR"] = str(folder)
+    else:
+        _import_from_other_ends(config.workerinput["workerid"])
 
 
 def pytest_collection_finish():
@@ -38,10 +42,10 @@ def pytest_collection_finish():
 def pytest_collection_modifyitems(items):
     # The longest begin first, so that no process waits for one alone at the end.
     longest = [
-        "test_tutorial", "test_characterising", "test_evidence", "test_scope_page", "test_ends",
-        "test_missing_physics", "faults/test_analysis", "test_cli", "test_docstrings",
-        "boards/test_boards", "firmware/test_core", "faults/test_device", "test_uncertainty",
-        "test_hal_boards", "test_friction_identification", "test_combinations", "test_compile",
+        "test_tutorial", "test_missing_physics", "test_characterising", "test_cli",
+        "test_scope_page", "test_uncertainty", "test_ends", "test_evidence", "faults/test_analysis",
+        "test_docstrings", "boards/test_boards", "firmware/test_core", "faults/test_device",
+        "test_friction_identification", "test_hal_boards", "test_combinations", "test_compile",
         "test_campaigns", "test_simulation", "test_structures", "test_constant_velocity",
         "test_innovations", "test_contract", "test_library", "sim_rig/test_device",
         "test_discrimination", "test_site", "test_exits", "test_replay", "test_hysteresis_loop",
@@ -53,6 +57,18 @@ def pytest_collection_modifyitems(items):
         return next((n for n, name in enumerate(longest) if f"{name}.py" in path), len(longest))
 
     items.sort(key=place)
+
+
+def _import_from_other_ends(worker):
+    """Of what all tests import, processes of pytest-xdist begin with different packages.
+
+    In a new environment nothing has been compiled to bytecode: each then compiles a part, and
+    loads what the other has compiled meanwhile, instead of both the whole in the same order.
+    """
+    packages = ["numba", "pandas", "matplotlib.figure", "bokeh.plotting", "scipy.stats", "sklearn"]
+    for package in packages if worker == "gw0" else packages[::-1]:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(package)
 
 
 def _keep_bytecode():

@@ -416,7 +416,7 @@ def test_ranges_from_a_data_sheet_and_from_the_log(captured, tmp_path):
         "R_b: {range: [100, 150]}\n"
     )
     (tmp_path / "id.yaml").write_text(
-        "population: 20\ngenerations: 2\ndatasheet: motor.yaml\nfixed: {R_b: 126}\n"
+        "preset: thesis\npopulation: 20\ngenerations: 2\ndatasheet: motor.yaml\nfixed: {R_b: 126}\n"
     )
     out = tmp_path / "out"
     result = rig("identify", folder, "--config", tmp_path / "id.yaml", "--guess", "--out", out,
@@ -429,7 +429,7 @@ def test_ranges_from_a_data_sheet_and_from_the_log(captured, tmp_path):
     assert found["L_m"]["source"] == f"{sheet}:2" and found["L_m"]["fixed"] is True
     assert found["L_m"]["value"] == pytest.approx(1.18e-3)
     # The configuration goes before the data sheet.
-    assert found["R_b"]["value"] == 126 and found["R_b"]["source"] == f"{tmp_path}/id.yaml:4"
+    assert found["R_b"]["value"] == 126 and found["R_b"]["source"] == f"{tmp_path}/id.yaml:5"
     assert "current_motor over its command" in found["K_dm"]["source"]
     assert folder.name in found["K_dm"]["source"]
     low, high = found["K_dm"]["range"]

@@ -150,7 +150,7 @@ def drive_log(cogging, seed=0, n=1200, dt=2e-3):
     return Dataset(inputs, exact + [2e-5, 2e-3] * rng.standard_normal((n, 2)), dt)
 
 
-@pytest.mark.parametrize("cogging", mostly_soak([0.1, 0.0]))
+@pytest.mark.parametrize("cogging", mostly_soak([0.1, 0.0], always=0))
 def test_a_force_that_repeats_with_a_position_is_named_with_its_period(cogging):
     record = drive_log(cogging)
     estimator = GASSI(DRIVE, population=30, generations=10).fit(record)
@@ -216,13 +216,15 @@ def cell_log(seed, held, empty=3.05, loss=0.0, curved=0.0):
 
 @pytest.mark.parametrize(
     ("seed", "held", "plant", "term"),
-    [
-        (1, 30, {"loss": 0.1}, ("charge", "abs")),
-        (0, 1, {"curved": 0.3}, ("lagging", "square")),
-        (2, 30, {"curved": 0.3, "empty": 300.0}, ("lagging", "square")),
-        (3, 30, {"empty": 300.0}, None),
-        (4, 2, {}, None),
-    ],
+    mostly_soak(
+        [
+            (1, 30, {"loss": 0.1}, ("charge", "abs")),
+            (0, 1, {"curved": 0.3}, ("lagging", "square")),
+            (2, 30, {"curved": 0.3, "empty": 300.0}, ("lagging", "square")),
+            (3, 30, {"empty": 300.0}, None),
+            (4, 2, {}, None),
+        ]
+    ),
 )
 def test_functions_of_a_held_input_are_named_however_far_from_zero_the_output_is(
     seed, held, plant, term
@@ -334,7 +336,7 @@ def slow_input(seed, late=0):
     return Dataset(seen, y + 0.002 * rng.standard_normal(y.shape), 0.002, **noise)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", mostly_soak([0, 2]))
 def test_a_noisy_input_is_late_if_it_is_and_not_else(seed):
     for late in (0, 5):
         record = slow_input(seed, late)
@@ -562,7 +564,7 @@ def verdict_on_levels(*noise, seed):
     return verdict_of(estimator, records[:1], records[1:])
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", mostly_soak([1, 2]))
 def test_noise_of_levels_that_makes_intervals_too_narrow_is_named(seed):
     """What a slow plant makes of it is hidden below its sensor's noise, and sways estimates."""
     verdict = verdict_on_levels(0.04, seed=seed)
@@ -621,7 +623,8 @@ def oscillator_log(friction, seed, n=800, dt=0.01, parts=10):
             ),
             (lambda v: 6.0 * v * abs(v), "a term in v (square) in dv/dt"),
             (lambda v: 0.0, ""),
-        ]
+        ],
+        always=0,
     ),
 )
 def test_functions_of_a_state_that_swings_in_a_dozen_samples_are_named(friction, words):
@@ -769,7 +772,10 @@ FIRST_ORDER = ProcessModel(
 
 @pytest.mark.parametrize(
     "pwm",
-    [(2, 30, 58, 86, 114, 142, 170, 198, 226, 254, 2, 30), (0, 120, 250, 120, 0, 60, 180)],
+    [
+        (2, 30, 58, 86, 114, 142, 170, 198, 226, 254, 2, 30),
+        pytest.param((0, 120, 250, 120, 0, 60, 180), marks=pytest.mark.soak),
+    ],
     ids=["upwards", "to and fro"],
 )
 def test_nothing_is_found_that_physics_forbids(pwm):

@@ -1149,10 +1149,16 @@ def rig_objective(record, values, fixed=()):
     return Objective(BatchSimulator(model), space, [record]), at
 
 
+@pytest.fixture(scope="module")
+def rig_result(rig_minimum):
+    """What is known of all parameters there."""
+    record, _, start = rig_minimum
+    return uncertainty(*rig_objective(record, start))
+
+
 @pytest.mark.soak
-def test_the_redundancies_of_the_actuator_are_found(rig_minimum):
-    record, values, start = rig_minimum
-    result = uncertainty(*rig_objective(record, start))
+def test_the_redundancies_of_the_actuator_are_found(rig_minimum, rig_result):
+    values, result = rig_minimum[1], rig_result
     groups = {frozenset(a.parameters): a for a in result.ambiguities}
     bristle = frozenset({"A", "alpha0", "alpha1", "z(0)"})
     coil = frozenset({"R_b", "L_b", "K_db"})
@@ -1168,10 +1174,9 @@ def test_the_redundancies_of_the_actuator_are_found(rig_minimum):
 
 
 @pytest.mark.soak
-def test_what_to_measure_on_the_actuator_resolves_it(rig_minimum):
+def test_what_to_measure_on_the_actuator_resolves_it(rig_minimum, rig_result):
     record, _, start = rig_minimum
-    result = uncertainty(*rig_objective(record, start))
-    measure = [name for a in result.ambiguities for name in a.measure]
+    measure = [name for a in rig_result.ambiguities for name in a.measure]
     after = uncertainty(*rig_objective(record, start, fixed=measure))
     assert not after.ambiguities
     assert {e.why for e in after.parameters} <= {"", "vague"}
