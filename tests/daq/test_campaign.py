@@ -125,6 +125,7 @@ def test_what_a_campaign_keeps_starts_where_its_fit_did(tmp_path):
     assert rmse == pytest.approx(document["runs"][0]["rmse_x"], rel=1e-3) and rmse < 0.0105  # noise
 
 
+@pytest.mark.soak
 def test_each_run_is_identified_with_the_model_of_its_experiment(tmp_path):
     models = {"bouc": "actuator", "dahl": "actuator:hysteresis=dahl"}
     for name, model in models.items():

@@ -290,6 +290,7 @@ def test_a_copy_of_the_training_log_is_no_validation(folder):
             assert f"{copy}: its samples are those of day1.csv, which is" in result.stderr
 
 
+@pytest.mark.soak
 def test_errors_stand_in_physical_units_everywhere(folder):
     configured(folder)
     words = ("identify", "day1.csv", "--validate", "day2.csv", "--config", "id.yaml")
@@ -356,6 +357,7 @@ def test_a_term_that_is_none_is_named(folder, change, named):
         settled(folder, terms=[{**RUBBING, **change}])
 
 
+@pytest.mark.soak
 def test_a_sensor_between_motor_and_brake_is_not_taken_for_one_at_the_load(tmp_path):
     text = find_file("protocol", "constant_velocity.yaml").read_text(encoding="utf-8")
     quick = {"velocities": [20.0], "brake_commands": [0.0], "measure": 0.5}

@@ -104,6 +104,7 @@ def test_a_limit_is_kept_by_the_margin():
         assert (records is not None) == passes, config.name
 
 
+@pytest.mark.soak
 def test_speeds_keep_the_margin_from_what_currents_can_make_of_them():
     shaken = commands(0.0)
     shaken[:, 0] = 1.5 * np.sin(2.0 * np.pi * 40.0 * np.arange(400) / 800.0)

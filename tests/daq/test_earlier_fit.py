@@ -55,8 +55,13 @@ def identified(case, values=None, ends=None, *, settled=True):
     return result, [note.text for note in said if isinstance(note, Note)]
 
 
-def test_it_comes_to_what_a_search_comes_to_without_one(case):
-    searched, _ = identified(case)
+@pytest.fixture(scope="module")
+def searched(case):
+    """The fit of both logs by a search of its own."""
+    return identified(case)[0]
+
+
+def test_it_comes_to_what_a_search_comes_to_without_one(case, searched):
     begun, notes = identified(case, *of(case[2]))
     assert ANEW not in notes
     assert begun.estimator.n_simulations_ < 0.5 * searched.estimator.n_simulations_
@@ -66,10 +71,9 @@ def test_it_comes_to_what_a_search_comes_to_without_one(case):
         assert of(begun)[1][name] == pytest.approx((low, high), rel=0.02)
 
 
-def test_a_start_that_all_logs_speak_against_leads_to_a_search(case):
+def test_a_start_that_all_logs_speak_against_leads_to_a_search(case, searched):
     values, ends = of(case[2])
     wrong = {name: (1.2 * low, 1.2 * high) for name, (low, high) in ends.items()}
-    searched, _ = identified(case)
     begun, notes = identified(case, {n: 1.2 * v for n, v in values.items()}, wrong)
     assert ANEW in notes
     for name, (low, high) in of(searched)[1].items():
@@ -90,8 +94,7 @@ def test_logs_at_odds_or_noisier_than_before_speak_against_a_start(case):
     assert not earlier.agrees(at_odds)
 
 
-def test_an_earlier_fit_that_left_something_open_is_among_the_starts_of_a_search(case):
-    searched, _ = identified(case)
+def test_an_earlier_fit_that_left_something_open_is_among_the_starts_of_a_search(case, searched):
     begun, notes = identified(case, *of(case[2]), settled=False)
     assert ANEW not in notes
     assert begun.estimator.n_simulations_ > 0.5 * searched.estimator.n_simulations_

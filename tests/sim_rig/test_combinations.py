@@ -23,13 +23,14 @@ from tests.sim_rig.support import (
     combinations,
     random_point,
 )
+from tests.soak import mostly_soak
 from tests.sysid.reference import simulate as reference
 from tests.sysid.support import outputs_of
 
 
 @pytest.mark.parametrize("load", LOADS)
 @pytest.mark.parametrize("hysteresis", HYSTERESES, ids=str)
-@pytest.mark.parametrize("smooth", [False, True], ids=["exact", "smooth"])
+@pytest.mark.parametrize("smooth", mostly_soak([False, True]), ids=["exact", "smooth"])
 def test_every_combination_is_its_equations(hysteresis, smooth, load):
     rng = random.Random(1)
     for parts in combinations(hysteresis=hysteresis, smooth=smooth, load=load):
