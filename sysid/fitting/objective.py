@@ -30,8 +30,9 @@ FLOORS = (1e-1, 1e-2, 1e-3)
 # Whether records count by their samples or each alike.
 Balance = Literal["samples", "logs"]
 
-# Integration steps per sample that are never too many, and how many times those of most are.
-_FEW_STEPS, _FAR_MORE = 64, 8
+# Integration steps per sample that are never too many, and how many times those of most are, and of
+# chromosomes that have proved to be good.
+_FEW_STEPS, _FAR_MORE, _MORE = 64, 8, 2
 
 
 @dataclass(frozen=True)
@@ -150,15 +151,18 @@ class Objective:
         """The objective of the free run's errors: this one."""
         return self
 
-    def sparing(self) -> Objective:
+    def sparing(self, good: Sequence[FloatArray] = ()) -> Objective:
         """The same objective, in which chromosomes fail that are far slower to simulate than most.
 
         A few that are stiff would take most of a search's time. Most are taken to need the steps
-        of the middle of the ranges.
+        of the middle of the ranges. good: chromosomes (n_free,) that must not fail, nor what is
+        near them: a run that drives a plant to its ends may be stiff at the true parameters alone.
         """
-        middle = self.space.full(self.space.decode(np.mean(self.space.coded_bounds, axis=0)[None]))
-        steps = [int(self.simulator.steps_of_each(middle, record)[0]) for record in self.records]
-        return self._with(simulator=self.simulator.within(max(_FEW_STEPS, _FAR_MORE * max(steps))))
+        middle = self.space.decode(np.mean(self.space.coded_bounds, axis=0))
+        vectors = self.space.full(np.stack([middle, *good]))
+        steps = np.max([self.simulator.steps_of_each(vectors, r) for r in self.records], axis=0)
+        most = max(_FEW_STEPS, _FAR_MORE * int(steps[0]), _MORE * int(steps[1:].max(initial=0)))
+        return self._with(simulator=self.simulator.within(most))
 
     def finer(self, accuracy: float) -> Self:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""

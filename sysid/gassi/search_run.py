@@ -50,7 +50,7 @@ class SearchRun:
 
     def __post_init__(self) -> None:
         refines = self.search.preset.refine
-        self._bred = self.objective.sparing() if refines else self.objective
+        self._bred = self.objective.sparing(self.begun) if refines else self.objective
 
     @property
     def done(self) -> bool:

@@ -1,5 +1,7 @@
 """A search that begins where a fit of some of the records has ended as well."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -14,6 +16,7 @@ from sysid import (
     ProcessModel,
     State,
 )
+from sysid.engine.simulation import BatchSimulator
 
 DT, NOISE, WIDTH = 0.01, 0.01, 0.015
 TRUTH = {"first": 0.62, "second": 0.37, "tau": 0.05}
@@ -87,3 +90,29 @@ def test_nothing_is_searched_for_where_an_earlier_fit_is_settled(records):
     )
     assert settled.parameters_ == pytest.approx(begun.parameters_, rel=1e-4)
     assert settled.n_simulations_ < 0.5 * searched.n_simulations_
+
+
+def pendulum():
+    """One that falls to rest within a few samples, some of which it swings twice in."""
+    return ProcessModel(
+        name="pendulum",
+        states=(State("angle", "rad"), State("speed", "rad/s")),
+        inputs=(Input("torque", "N*m"),),
+        outputs=(Output("angle", "rad"),),
+        parameters=(
+            Parameter("rate", "rad/s", 100.0, 0.1, 3e3, "log"),
+            Parameter("decay", "1/s", 20.0, 1.0, 400.0, "log"),
+        ),
+        derivative=lambda x, u, p: (x[1], -(p[0] ** 2) * math.sin(x[0]) - p[1] * x[1] + u[0]),
+    )
+
+
+def test_an_earlier_fit_may_be_far_stiffer_than_the_middle_of_the_ranges():
+    truth, time = {"rate": 2000.0, "decay": 200.0}, np.arange(0.0, 0.3, DT)
+    rest = Dataset(np.zeros((len(time), 1)), np.full((len(time), 1), 2.0), DT)
+    exact = BatchSimulator(pendulum(), accuracy=1e-6, max_steps=4096)
+    angle = exact.trajectories(np.array([[*truth.values()]]), rest)[0]
+    noise = NOISE * np.random.default_rng(0).standard_normal(angle.shape) * (time > 0.0)[:, None]
+    log = Dataset(rest.inputs, angle + noise, DT)
+    begun = GASSI(pendulum(), **FEW).fit(log, earlier=EarlierMinima([truth], is_settled=True))
+    assert begun.parameters_ == pytest.approx(truth, rel=0.05)
