@@ -83,12 +83,11 @@ class _Changes:
     whole: bool
 
     @classmethod
-    def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray) -> _Changes:
+    def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray, whole: bool) -> _Changes:
         """rates: in counts per tick."""
         rows = np.flatnonzero(np.diff(counts, prepend=np.nan))
         behind = np.minimum(rows + 1, len(tick) - 1)
         rate, latest = rates[rows], tick[rows].astype(np.float64)
-        whole = _are_of_whole_samples(tick, counts, rates)
         moved = np.diff(counts[rows], prepend=np.nan)
         with np.errstate(divide="ignore"):
             length = (np.abs(moved) if whole else 1.0) / np.abs(rate)
@@ -145,9 +144,9 @@ class _Intervals:
     agreeing: int  # of them
 
     @classmethod
-    def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray) -> _Intervals:
+    def of(cls, tick: IntArray, counts: FloatArray, rates: FloatArray, whole: bool) -> _Intervals:
         """rates: in counts per tick."""
-        changes = _Changes.of(tick, counts, rates)
+        changes = _Changes.of(tick, counts, rates, whole)
         rate, length, latest = changes.rate, changes.length, changes.latest
         least, most = changes.waits()
         wait = _waits_by_silence(tick, rates, changes, most)
@@ -193,7 +192,8 @@ def _are_of_whole_samples(tick: IntArray, counts: FloatArray, rates: FloatArray)
     """Whether speeds are means of all counts of a sample, and not of the last.
 
     A mean over a sample is behind one over its last interval, by half a sample less half of the
-    interval: so do rates differ from the counts of the sample as the speed changes.
+    interval: so do rates differ from the counts of the sample as the speed changes. Where it swings
+    within a few samples chords do not tell how it changes, and this is no more than likely.
     """
     lone = (np.diff(tick)[:-1] == 1) & (np.diff(tick)[1:] == 1)
     moved, rate = np.diff(counts)[:-1], rates[1:-1]
@@ -297,12 +297,25 @@ def mean_speeds(
     counts = np.rint(theta / count)
     if np.abs(theta / count - counts).max() > _OFF_COUNT:
         return None
-    intervals = _Intervals.of(tick, counts, omega * (dt / count))
-    if not intervals.show_edges(by_edges):
+    intervals = _shown_by(tick, counts, omega * (dt / count), by_edges)
+    if intervals is None:
         return None
     rates, begin, end, deviation = _at_rows(intervals, tick)
     windows = np.stack([begin - tick, end - tick], axis=1) * dt
     return MeanSpeeds(rates * (count / dt), windows, deviation * dt)
+
+
+def _shown_by(
+    tick: IntArray, counts: FloatArray, rates: FloatArray, stated: bool
+) -> _Intervals | None:
+    """The intervals that made the speeds, of all counts of a sample only where edges agree."""
+    for whole in (True, False):
+        if whole and not _are_of_whole_samples(tick, counts, rates):
+            continue
+        intervals = _Intervals.of(tick, counts, rates, whole)
+        if intervals.show_edges(stated):
+            return intervals
+    return None
 
 
 def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, ...]:

@@ -223,6 +223,23 @@ def test_speeds_that_are_means_of_all_counts_of_a_sample_are_recognised(angle, e
     assert np.sqrt(np.nanmean(errors**2)) < error
 
 
+def slipping(t):
+    """To and fro at up to 11 rad/s, so fast that chords do not tell how the speed changes."""
+    phase = 2.0 * math.pi * 120.3 * t
+    swing = 8.2 * np.sin(phase) + 2.4 * np.sin(2.0 * phase + 0.2)
+    return 0.21 - 3.6 * t + swing / (2.0 * math.pi * 120.3)
+
+
+def test_speeds_of_last_intervals_that_look_like_those_of_whole_samples_are_told_by_the_edges():
+    tick, theta, omega = logged(slipping, 0.4)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
+    error = speeds.values - mean_over(slipping, speeds.windows)
+    assert np.isfinite(error).mean() > 0.75
+    assert np.sqrt(np.nanmean(error**2)) < 0.25
+    # It was the last interval's end that lay close to the sample, not the sample's middle.
+    assert np.median(speeds.windows[np.isfinite(error), 0]) > -0.5 * DT
+
+
 @pytest.mark.parametrize("told", [True, False])
 def test_who_says_that_edges_made_the_speeds_is_not_believed_against_the_log(told):
     tick, theta, _ = logged(swinging, 1.2)
