@@ -15,8 +15,7 @@ class FilterSettings:
     standard deviations of the states' rates over the root of a second. colour: (n_inputs,), parts
     of the inputs' noise that go on from sample to sample. corrects: whether outputs correct the
     states; else innovations are those of the free run. exact: whether averaged outputs are what
-    free runs say, not taken for parabolas between samples; beyond: (n_samples, n_outputs, n) for
-    so many parameter vectors, by how much they are none, where that is known.
+    free runs say, not taken for parabolas between samples.
 
     >>> import numpy as np
     >>> FilterSettings(np.array([0.1]), process=0.5).corrects
@@ -30,4 +29,3 @@ class FilterSettings:
     colour: FloatArray | float = 0.0
     corrects: bool = True
     exact: bool = False
-    beyond: FloatArray | None = None

@@ -228,9 +228,7 @@ class RecordSimulator:
             inputs = with_bends(model, record, kernel.splines)
             self._inputs_of[tuple(kernel.splines)] = inputs
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
-        if settings.beyond is not None:
-            measured[..., : len(lanes)] -= settings.beyond[..., lanes]
-        elif settings.exact:
+        if settings.exact:
             measured -= self.beyond_parabolas(parameters, starts, lanes, n_steps)
         with explained_errors(model):
             kalman.innovations(

@@ -27,7 +27,7 @@ belongs to the sum: without it, parameters that pass on more of that noise would
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from math import comb
 from typing import Any, Self, TypeGuard
@@ -70,29 +70,7 @@ _OFF = 1.5
 _FEWEST = 2  # a sample, where a free run takes more
 _PART = 0.5  # of a deviation that steps of a free run may move any quantity by
 _MANY = 32  # a sample, with which no covariance bursts
-_NEARBY = 1e-3  # of the ranges: how far from a place slopes of averages' shape are told
 _BURST = 0.1  # of the innovations, by which steps of a free run may change them
-
-
-@dataclass(frozen=True)
-class Shape:
-    """By how much means over windows are not those of parabolas, in proportion around a place.
-
-    at: (n_free,), search coordinates. values: per record, (n_samples, n_outputs); slopes: of these,
-    (n_samples, n_outputs, n_free).
-    """
-
-    at: FloatArray
-    values: list[FloatArray]
-    slopes: list[FloatArray]
-
-    def of(self, coded: FloatArray) -> list[FloatArray]:
-        """Per record, (n_samples, n_outputs, n), at search coordinates (n, n_free)."""
-        moves = (coded - self.at).T
-        return [
-            value[..., None] + slope @ moves
-            for value, slope in zip(self.values, self.slopes, strict=True)
-        ]
 
 
 class Innovations(Objective):
@@ -105,8 +83,8 @@ class Innovations(Objective):
     samples beside the noise, by the jitter of their windows. Where it corrects, the records have
     each mean over a window once. coarseness: integration steps of a free run that one of the
     filter's stands for; least: of the filter's in a sample. exact: whether averages are not of
-    parabolas between samples. shape: by how much they are not, where that is known. trust: per
-    record, (n_samples, n_outputs), parts of each innovation that count.
+    parabolas between samples. trust: per record, (n_samples, n_outputs), parts of each innovation
+    that count.
     """
 
     noise: FloatArray
@@ -119,7 +97,6 @@ class Innovations(Objective):
     coarseness: float
     least: int
     exact: bool
-    shape: Shape | None
     trust: list[FloatArray]
 
     @classmethod
@@ -150,7 +127,7 @@ class Innovations(Objective):
         variant.noise = variant.error = np.maximum(noise, _TINY)
         variant.scatter = variant._scatters(near)
         variant.trust = _full(variant.records)
-        variant.corrects, variant.exact, variant.shape = corrects, False, None
+        variant.corrects, variant.exact = corrects, False
         variant.coarseness, variant.least = 1.0, 1
         n_states = len(objective.simulator.model.states)
         variant.process = np.zeros(n_states) if process is None else process
@@ -239,25 +216,6 @@ class Innovations(Objective):
                 break
             finer = self._with(coarseness=coarseness)
         return finer
-
-    def around(self, chromosome: FloatArray) -> Self:
-        """The same near a chromosome, (n_free,), where free runs need not tell each mean anew."""
-        if not self.exact:
-            return self
-        lower, upper = self.space.coded_bounds
-        at, distance = self.space.encode(chromosome), _NEARBY * (upper - lower)
-        coded = np.vstack([at, at + np.diag(distance), at - np.diag(distance)])
-        chromosomes = self.space.decode(coded)
-        vectors, starts = self.space.full(chromosomes), self._starts(chromosomes)
-        values, slopes, n = [], [], len(at)
-        steps = self.steps_needed(chromosome[None])[0].tolist()
-        for record, count, start in zip(self.records, steps, starts, strict=True):
-            beyond = self.simulator.beyond_parabolas(vectors, record, count, start)
-            beyond = np.where(np.isfinite(beyond), beyond, 0.0)
-            values.append(beyond[0])
-            change = beyond[1 : n + 1] - beyond[n + 1 :]
-            slopes.append(np.moveaxis(change, 0, -1) / (2.0 * distance))
-        return self._with(shape=Shape(at, values, slopes))
 
     @property
     def uneased(self) -> Self:
@@ -525,7 +483,7 @@ class Innovations(Objective):
             self.scales[place],
             n_steps,
             self._starts(chromosome[None])[place][0],
-            self._settings(chromosome[None])[place],
+            self._settings()[place],
         )
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
@@ -548,22 +506,17 @@ class Innovations(Objective):
             self.scales,
             steps,
             starts,
-            self._settings(chromosomes),
+            self._settings(),
             balanced=balanced,
         )
 
-    def _settings(self, chromosomes: FloatArray) -> list[FilterSettings]:
-        """Per record, those of a filter at chromosomes, (n, n_free)."""
-        beyond: Sequence[FloatArray | None] = [None] * len(self.records)
-        if self.shape is not None:
-            beyond = self.shape.of(self.space.encode(chromosomes))
+    def _settings(self) -> list[FilterSettings]:
+        """Per record, those of a filter."""
         return [
             FilterSettings(
-                self.noise, scatter, trust, self.process, colour, self.corrects, self.exact, each
+                self.noise, scatter, trust, self.process, colour, self.corrects, self.exact
             )
-            for scatter, trust, colour, each in zip(
-                self.scatter, self.trust, self.colour, beyond, strict=True
-            )
+            for scatter, trust, colour in zip(self.scatter, self.trust, self.colour, strict=True)
         ]
 
 

@@ -633,7 +633,7 @@ class _Analysis:
         drafts, fits = list(drafts), list(self.ridge)
         for _ in range(_ROUNDS):
             searches = [
-                (k, tracer.beside(begin) if begin else tracer, sign, begin)
+                (k, tracer, sign, begin)
                 for k, draft in enumerate(drafts)
                 if (tracer := draft.tracer)
                 for sign, begin in draft.searches(fits).items()

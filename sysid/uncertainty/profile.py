@@ -1,9 +1,8 @@
 """Profile likelihood: how much worse the best fit becomes as one parameter is moved."""
 
-import copy
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -118,7 +117,7 @@ def traced(
                 wanted[i] = searches[i][1].send(answer)  # type: ignore[arg-type]  # None begins it
             except StopIteration as end:
                 results[i] = end.value
-        made = _fitted([(searches[i][0], task) for i, task in wanted.items()])
+        made = _fitted([(searches[i][0], task) for i, task in wanted.items()]) if wanted else []
         answers = dict(zip(wanted, made, strict=True))
         if fits is not None:
             fits += made
@@ -126,17 +125,15 @@ def traced(
 
 
 def _fitted(tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
-    """The best fits to places."""
-    fits: dict[int, Fit] = {}
-    for objective in {id(tracer.objective): tracer.objective for tracer, _ in tasks}.values():
-        places = [k for k, (tracer, _) in enumerate(tasks) if tracer.objective is objective]
-        descents = _begun(objective, [tasks[k] for k in places])
-        ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
-        errors, coded = objective.evaluate(ends)[0].tolist(), objective.space.encode(ends)
-        for k, error, at in zip(places, errors, coded, strict=True):
-            tracer, wanted = tasks[k]
-            fits[k] = Fit(wanted.place, tracer.statistic(error), at, error)
-    return [fits[k] for k in range(len(tasks))]
+    """The best fits to places, by what one estimate was fitted by."""
+    objective = tasks[0][0].objective
+    descents = _begun(objective, tasks)
+    ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
+    errors, coded = objective.evaluate(ends)[0].tolist(), objective.space.encode(ends)
+    return [
+        Fit(wanted.place, tracer.statistic(error), at, error)
+        for (tracer, wanted), error, at in zip(tasks, errors, coded, strict=True)
+    ]
 
 
 def _begun(objective: Objective, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Descent]:
@@ -165,7 +162,7 @@ class Tracer:
         quantity: Profiled,
     ) -> None:
         self.quantity, self.start = quantity, local.objective.space.encode(local.chromosome)
-        self._local, self._near, objective = local, self.start, local.criterion
+        self.objective = objective = local.criterion
         self.centre = quantity.at(self.start)
         self.error = local.error
         deviation = covariance.deviation(gradient)
@@ -254,17 +251,6 @@ class Tracer:
             return outside.place
         share = 0.5 if halve else _share(inside, outside)
         return inside.place + share * (outside.place - inside.place)
-
-    @property
-    def objective(self) -> Objective:
-        """What is fitted, for places around the estimate or, of ``beside``, a fit."""
-        return self._local.around(self._near)
-
-    def beside(self, fit: Fit) -> Self:
-        """The same for places around a fit, perhaps far from the estimate."""
-        tracer = copy.copy(self)
-        tracer._near = fit.at
-        return tracer
 
     def statistic(self, error: float) -> float:
         """Twice the loss of log-likelihood by an error."""

@@ -68,19 +68,6 @@ class Sensitivity:
         """Slopes of the outputs that have a weight, (n_rows, n_free)."""
         return self.slopes[:, self.objective.weights > 0.0].reshape(-1, len(self.chromosome))
 
-    def around(self, at: FloatArray) -> Objective:
-        """The criterion for places around search coordinates, (n_free,)."""
-        if not isinstance(self.criterion, Innovations):
-            return self.criterion
-        key = at.tobytes()
-        if key not in self._nearby:
-            self._nearby[key] = self.criterion.around(self.objective.space.decode(at))
-        return self._nearby[key]
-
-    @cached_property
-    def _nearby(self) -> dict[bytes, Objective]:
-        return {}
-
     @cached_property
     def error(self) -> float:
         """What the criterion is at the chromosome."""
