@@ -56,6 +56,7 @@ def remedies(
     # A gain or offset that wrong samples, or unknown inputs in a gap, may feign is not fitted yet.
     spoiled = any(fault.kind in _OF_SAMPLES for fault in doubts)
     of_channels = dict(_of_channels(settings, of_all_logs, units)).items()
+    changes |= {f"fixed.{f.name}": "null" for f in findings if f.kind == "fixed" and f.counts}
     changes |= {k: v for k, v in of_channels if not (spoiled and k.startswith("channels."))}
     if not changes and not spoiled:  # what is wrong with the data drives parameters to the ends
         changes |= dict(_of_ranges(pushed or {}))

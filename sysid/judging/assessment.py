@@ -554,7 +554,8 @@ def _moving(finding: Finding) -> str:
         else f"{100.0 * finding.share:.0f} % of what is left"
     )
     # A line leads nowhere that far.
-    return f"{says}{text} ({chance})" + (f"; {effect}." if not finding.turned_round else ".")
+    far = finding.turned_round or finding.kind == "rest"
+    return f"{says}{text} ({chance})" + (f"; {effect}." if not far else ".")
 
 
 def _in_vain(finding: Finding, fitted: Alternative) -> str:

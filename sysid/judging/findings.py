@@ -97,10 +97,14 @@ _WORDS = {
     "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on{instead}",
     "noise": "{name} is logged with noise of {amplitude:.2g} {unit}, which has not acted",
     "saturation": "{name} saturates near its largest values",
+    "fixed": "{name}, which is fixed, would be {times:.3g} times its value, or the gain of a "
+    "channel is wrong that looks the same",
     "exchange": "{name} have changed places in the log",
 }
 # What has no single amplitude.
 _SHAPES = {
+    "rest": "another {name}, as behind a driver that opens between pulses: the model's equations "
+    "want a case for that",
     "bend": "a {name} that changes with the size of what it multiplies",
     "curve": "a curve between {name} and what is logged of it, as of a sensor that bends",
     "disturbance": "a slow signal in d{name}/dt that nobody measured",
@@ -130,7 +134,14 @@ def description(finding: Finding) -> str:
     text = _WORDS[finding.kind]
     size = abs(amplitude) if finding.kind == "delay" else amplitude
     return (
-        text.format(name=finding.name, late=late, amplitude=size, unit=unit, instead=instead)
+        text.format(
+            name=finding.name,
+            late=late,
+            amplitude=size,
+            times=1.0 + size,
+            unit=unit,
+            instead=instead,
+        )
         .replace("  ", " ")
         .strip()
     )

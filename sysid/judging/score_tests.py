@@ -39,9 +39,11 @@ from sysid.judging.suspects import (
     channel_suspects,
     curve_suspects,
     disturbance_suspects,
+    fixed_suspects,
     function_suspects,
     head,
     in_single_records,
+    rest_suspects,
     variant_suspects,
 )
 from sysid.judging.whitener import Whitener
@@ -56,11 +58,19 @@ from sysid.uncertainty.sensitivity import (
 from sysid.uncertainty.ties import free_gradient, named_values
 
 _LOG_CHANCE = np.log(1e-3)  # of the probability of a finding by chance, all tests together
-_SEVERAL = ("variant", "bend", "function", "curve", "disturbance")  # have no single amplitude
+_SEVERAL = (
+    "variant",
+    "bend",
+    "function",
+    "curve",
+    "disturbance",
+    "rest",
+)  # have no single amplitude
 _SLOW = ("delay", "filter", "lag")
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
+_HALF = 0.5  # of the residuals' squares, which other equations at rest leave at most, to be named
 _AS_LATE = 0.8  # of what one explains that is early, that counts for as much where it is late
 _LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
 _FEW = 25  # samples for each amplitude, below which what they leave tells no colour
@@ -115,7 +125,8 @@ class ScoreTests:
         of_noise = ("gain", "play", *(_SLOW if filtered else ()))
         channels = [s for s in channels if s.kind not in of_noise or s.name not in noisy]
         channels += in_single_records([s for s in channels if s.kind != "noise"], runs)
-        self._named = [*channels, *variant_suspects(runs)]
+        held_values = fixed_suspects(runs, _fixed(objective))
+        self._named = [*channels, *held_values, *variant_suspects(runs)]
 
     @cached_property
     def suspicious(self) -> bool:
@@ -134,6 +145,10 @@ class ScoreTests:
         # Among more suspects what is left to chance by itself is so all the more.
         if not self.suspicious and not tests.are_significant(changing):
             return ()
+        at_rest = list(rest_suspects(self._runs))
+        if tests.leads([*self._named, *changing, *self._functions], at_rest):
+            tests.admit(at_rest, most=1)
+            return tests.settled()  # what else is found is of the wrong equations
         tests.admit([*self._named, *changing])
         if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
             tests.admit(self._functions)
@@ -202,10 +217,30 @@ class _Tests:
         results = self._tested(changes, suspects, left)
         return any(result.log_p + np.log(tests) < _LOG_CHANCE for result, _ in results.values())
 
-    def admit(self, suspects: Sequence[Suspect]) -> None:
+    def leads(self, suspects: Sequence[Suspect], before: Sequence[Suspect]) -> bool:
+        """Whether one of those before is there, and leaves least of all, and little, of the errors.
+
+        Of errors that are large, and by their squares as they are: each whitens them by a colour
+        of its own.
+        """
+        changes, left, tests = self._asked([*before, *suspects])
+        first = [i for i in left if i < len(before)]
+        results = self._tested(changes, before, first)
+        sure = [e for r, e in results.values() if r.log_p + np.log(tests) < _LOG_CHANCE]
+        least = min(map(self._squares, sure), default=1.0)
+        if least > _HALF:
+            return False
+        rest = self._tested(changes, [*before, *suspects], [i for i in left if i not in first])
+        return least < min((self._squares(e) for _, e in rest.values()), default=1.0)
+
+    def _squares(self, residual: FloatArray) -> float:
+        """Squares of what is left, in the mean of the outputs, in parts of the residuals'."""
+        return float(np.mean((residual / self._errors) ** 2))
+
+    def admit(self, suspects: Sequence[Suspect], most: int = _MOST) -> None:
         """Admit the suspects that are there by more than chance, each given those before it."""
         changes, left, tests = self._asked(suspects)
-        while left and len(self.findings) < _MOST:
+        while left and len(self.findings) < most:
             results = self._tested(changes, suspects, left)
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
             likely = [i for i in logs if logs[i] < _LOG_CHANCE]
@@ -486,16 +521,33 @@ class _Tests:
         return replace(move, change=float(np.clip(move.change, low - value, high - value)))
 
 
+def _fixed(objective: Objective) -> list[str]:
+    """Parameters that the user holds at a value, which nothing says is uncertain."""
+    space = objective.space
+    free = {*space.index, *(tie.index for tie in space.ties)}
+    free |= {*np.flatnonzero(objective.given.any(axis=0)).tolist()}
+    return [
+        parameter.name
+        for i, parameter in enumerate(space.model.parameters)
+        if i not in free and not parameter.fixed and space.base[i]
+    ]
+
+
 def _surest(suspects: Sequence[Suspect], tests: Mapping[int, tuple[float, Regressed]]) -> int:
     """Place of the surest of suspects, by logarithms of their probabilities and their tests.
 
-    Of probabilities too small for a number what explains more decides. Nothing is logged before it
+    Of probabilities too small for a number what explains more decides. A value that a user
+    fixed is less sure than the gain of a channel that looks the same. Nothing is logged before it
     happens: what comes late is surer than what would have to be early by about as much.
     """
     surest = min(log_p for log_p, _ in tests.values())
     alike = [i for i, (log_p, _) in tests.items() if log_p == surest]
     enough = _AS_MUCH * max(tests[i][1].share for i in alike)
     first = next(i for i in alike if tests[i][1].share >= enough)
+    if suspects[first].kind == "gain":
+        enough = _AS_MUCH * tests[first][1].share
+        fixed = [i for i in tests if suspects[i].kind == "fixed" and tests[i][1].share >= enough]
+        first = next(iter(fixed), first)
     if not (suspects[first].kind == "delay" and tests[first][1].amplitudes[0] < 0.0):
         return first
     enough = _AS_LATE * tests[first][1].share

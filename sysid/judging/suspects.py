@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
+from sysid.engine.linear_response import observed
 from sysid.judging.disturbed import DisturbedRun, of_each, shifted
 from sysid.judging.input_noise import likely_noise, standing_out
 from sysid.linear.polynomials import all_pole
@@ -39,6 +40,8 @@ Kind = Literal[
     "function",
     "curve",
     "disturbance",
+    "rest",
+    "fixed",
     "exchange",
 ]
 
@@ -65,6 +68,8 @@ _BENDS: tuple[Callable[[FloatArray], FloatArray], ...] = (
     lambda z: z**2,
     lambda z: 1.0 / (z + 0.05),
 )
+# Samples that an input stands at zero at least, and least share of records that it does or not.
+_AT_REST, _OFTEN = 5, 0.05
 _PROPORTIONAL = 1e-6  # what a term may be beside a signal that it is in proportion to
 _POINTS = 50  # at which an equation is asked for what it depends on
 # Stribeck speeds that are tried, in parts of the largest speed.
@@ -569,6 +574,59 @@ def _wave(function: np.ufunc, periods: int, run: DisturbedRun) -> FloatArray:
     n = run.record.n_samples
     wave: FloatArray = function(2.0 * np.pi * periods * np.arange(n) / n)
     return wave
+
+
+def fixed_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Iterator[Suspect]:
+    """Parameters, by name, that were held at a value from elsewhere, by parts of that value."""
+    model, vector = runs[0].model, runs[0].vector
+    for name in names:
+        place, moved = model.parameter_names.index(name), vector.copy()
+        moved[place] *= 1.0 + _PROBE
+        changes = of_each(runs, partial(_of_other_values, moved)) / _PROBE
+        yield Suspect("fixed", name, "1", changes[..., None])
+
+
+def _of_other_values(moved: FloatArray, run: DisturbedRun) -> FloatArray:
+    """Change of the outputs by other parameters, in the rates and in what is seen of the states."""
+    rates = run.rates_of(run.model.derivative, moved) - run.rates
+    seen, before = (
+        observed(run.model, run.states, run.record.inputs, values) for values in (moved, run.vector)
+    )
+    return run.added(rates) + run.logged(seen - before)
+
+
+def rest_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """Equations that are others while a held input stands at zero, as behind a driver that opens.
+
+    What acts then is told by the states: a winding that is open has no current, and its voltage,
+    which would have braked, drives none.
+    """
+    model = runs[0].model
+    for u, given in enumerate(model.inputs):
+        share = np.mean(np.concatenate([_at_rest(u, run) for run in runs]))
+        if given.hold != "zoh" or not _OFTEN < share < 1.0 - _OFTEN:
+            continue
+        for i in physical_equations(runs[0]):
+            along = [partial(_while_at_rest, u, j) for j in range(len(model.states))]
+            columns = np.stack([_added(runs, i, signal) for signal in along], axis=2)
+            name = f"d{model.states[i].name}/dt while {given.name} stands at 0"
+            yield Suspect("rest", name, f"{model.states[i].unit}/s", columns, of_input=True)
+
+
+def _at_rest(u: int, run: DisturbedRun) -> BoolArray:
+    """Samples (n_samples,) of stretches in which an input stands at zero."""
+    zero = run.record.inputs[:, u] == 0.0
+    edges = np.flatnonzero(np.diff(zero, prepend=False, append=False))
+    rest = np.zeros(len(zero), dtype=bool)
+    for begin, end in edges.reshape(-1, 2).tolist():
+        rest[begin:end] = end - begin >= _AT_REST
+    return rest
+
+
+def _while_at_rest(u: int, j: int, run: DisturbedRun) -> FloatArray:
+    """State j (n_samples,) while an input stands at zero."""
+    signal: FloatArray = np.where(_at_rest(u, run), run.states[:, j], 0.0)
+    return signal
 
 
 def change_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Iterator[Suspect]:

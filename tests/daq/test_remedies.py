@@ -60,6 +60,11 @@ def test_a_delay_is_added_to_what_is_taken_out_already():
     assert mended([found("mean", "y", 0.002)]) == ("averaged.y=0.002",)
 
 
+def test_a_value_fixed_wrong_is_freed():
+    assert mended([found("fixed", "R", -0.1)]) == ("fixed.R=null",)
+    assert not mended([found("fixed", "R", -0.1, share=0.1)])  # moves nothing
+
+
 def test_starts_on_an_end_are_searched_farther():
     """As of a swinging pendulum, whose held-back part begins in motion."""
     begun = [

@@ -789,3 +789,91 @@ def test_nothing_is_found_that_physics_forbids(pwm):
     assert moves and all(move.quantity.value + move.change >= 0.0 for move in moves)
     changes = [finding.amplitude for finding in findings if finding.kind == "change"]
     assert all(abs(change) < 3.0 for change in changes)
+
+
+def _motor_record(seed: int) -> Dataset:
+    """A motor of 2 ohm under levels of 20 ms, from sample to sample by the matrix exponential."""
+    rng = np.random.default_rng([seed, 7])
+    R, L, K, J, B, n = 2.0, 4e-3, 0.05, 2e-5, 2e-5, 600
+    a = np.array([[-R / L, -K / L, 1.0 / L], [K / J, -B / J, 0.0], [0.0, 0.0, 0.0]])
+    step = expm(a * DT)[:2]
+    voltage, x, rows = np.repeat(rng.uniform(-8.0, 8.0, n // 10), 10), np.zeros(2), []
+    for level in voltage:
+        rows.append(x)
+        x = step @ np.append(x, level)
+    noise = NOISE * rng.standard_normal((n, 2))
+    return Dataset(voltage[:, None], np.array(rows) + noise, DT, f"motor {seed}")
+
+
+def _driven_motor(x, u, p):
+    R, L, K, J, B = p
+    return (u[0] - R * x[0] - K * x[1]) / L, (K * x[0] - B * x[1]) / J
+
+
+DRIVEN_MOTOR = ProcessModel(
+    name="motor by voltage",
+    states=(State("current", "A"), State("omega", "rad/s")),
+    inputs=(Input("voltage", "V", "zoh"),),
+    outputs=(Output("current", "A"), Output("omega", "rad/s")),
+    parameters=(
+        Parameter("R", "ohm", 3.0, 0.2, 20.0, "log"),
+        Parameter("L", "H", 5e-3, 4e-4, 4e-2, "log"),
+        Parameter("K", "N*m/A", 0.08, 0.005, 0.5, "log"),
+        Parameter("J", "kg*m^2", 3e-5, 2e-6, 2e-4, "log"),
+        Parameter("B", "N*m*s/rad", 3e-5, 1e-6, 2e-4, "log"),
+    ),
+    derivative=_driven_motor,
+)
+
+
+@pytest.mark.parametrize("fixed", [2.2, 2.0])
+def test_a_value_that_is_fixed_wrong_is_named_with_what_it_would_be(fixed):
+    """By a channel's gain the data would be explained as well: the user's value comes first."""
+    training, validation = _motor_record(0), _motor_record(1)
+    estimator = GASSI(
+        DRIVEN_MOTOR, population=40, generations=10, random_state=0, fixed={"R": fixed}
+    ).fit([training])
+    verdict = verdict_of(estimator, [training], [validation])
+    reasons = " ".join(verdict.parameters.reasons)
+    if fixed == 2.0:
+        assert verdict.parameters.trust == "good"
+    else:
+        assert "R, which is fixed, would be 0.899 times its value" in reasons
+        assert "times what the model has" not in reasons
+
+
+def _pulsed_record(seed: int, opens: bool) -> Dataset:
+    """A speed under pulses with rests; a driver that opens lets the motor coast in them."""
+    rng = np.random.default_rng([seed, 8])
+    voltage = np.zeros(800)
+    for begin in range(20, 780, 50):
+        voltage[begin : begin + 20] = rng.choice([-1.0, 1.0]) * rng.uniform(3.0, 6.0)
+    omega, rows = 0.0, []
+    for level in voltage:
+        rows.append([omega])
+        end, tau = (0.0, 1.0) if opens and level == 0.0 else (20.0 * level, 0.03)
+        omega = end + (omega - end) * math.exp(-5e-3 / tau)
+    noise = 0.5 * rng.standard_normal((800, 1))
+    return Dataset(voltage[:, None], np.array(rows) + noise, 5e-3, f"pulses {seed}")
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_a_driver_that_opens_between_pulses_is_named(opens):
+    """Not as a time constant that changes, or play of the voltage, which explain as much."""
+    model = ProcessModel(
+        name="speed",
+        states=(State("omega", "rad/s"),),
+        inputs=(Input("voltage", "V", "zoh"),),
+        outputs=(Output("omega", "rad/s"),),
+        parameters=(
+            Parameter("gain", "rad/(s*V)", 30.0, 2.0, 200.0, "log"),
+            Parameter("tau", "s", 0.05, 3e-3, 3.0, "log"),
+        ),
+        derivative=lambda x, u, p: ((p[0] * u[0] - x[0]) / p[1],),
+    )
+    training, validation = (_pulsed_record(seed, opens) for seed in (0, 1))
+    estimator = GASSI(model, population=40, generations=10, random_state=0).fit([training])
+    verdict = verdict_of(estimator, [training], [validation])
+    reasons = " ".join(verdict.parameters.reasons)
+    assert ("another domega/dt while voltage stands at 0" in reasons) == opens
+    assert (verdict.trust == "good") != opens
