@@ -58,14 +58,8 @@ from sysid.uncertainty.sensitivity import (
 from sysid.uncertainty.ties import free_gradient, named_values
 
 _LOG_CHANCE = np.log(1e-3)  # of the probability of a finding by chance, all tests together
-_SEVERAL = (
-    "variant",
-    "bend",
-    "function",
-    "curve",
-    "disturbance",
-    "rest",
-)  # have no single amplitude
+# Have no single amplitude.
+_SEVERAL = ("variant", "bend", "function", "curve", "disturbance", "rest")
 _SLOW = ("delay", "filter", "lag")
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
@@ -146,7 +140,7 @@ class ScoreTests:
         if not self.suspicious and not tests.are_significant(changing):
             return ()
         at_rest = list(rest_suspects(self._runs))
-        if tests.leads([*self._named, *changing, *self._functions], at_rest):
+        if at_rest and tests.leads([*self._named, *changing, *self._functions], at_rest):
             tests.admit(at_rest, most=1)
             return tests.settled()  # what else is found is of the wrong equations
         tests.admit([*self._named, *changing])
@@ -536,8 +530,8 @@ def _fixed(objective: Objective) -> list[str]:
 def _surest(suspects: Sequence[Suspect], tests: Mapping[int, tuple[float, Regressed]]) -> int:
     """Place of the surest of suspects, by logarithms of their probabilities and their tests.
 
-    Of probabilities too small for a number what explains more decides. A value that a user
-    fixed is less sure than the gain of a channel that looks the same. Nothing is logged before it
+    Of probabilities too small for a number what explains more decides. Of a channel's gain and a
+    value that a user fixed, where both look the same, it is the value. Nothing is logged before it
     happens: what comes late is surer than what would have to be early by about as much.
     """
     surest = min(log_p for log_p, _ in tests.values())

@@ -578,21 +578,30 @@ def _wave(function: np.ufunc, periods: int, run: DisturbedRun) -> FloatArray:
 
 def fixed_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Iterator[Suspect]:
     """Parameters, by name, that were held at a value from elsewhere, by parts of that value."""
-    model, vector = runs[0].model, runs[0].vector
     for name in names:
-        place, moved = model.parameter_names.index(name), vector.copy()
-        moved[place] *= 1.0 + _PROBE
-        changes = of_each(runs, partial(_of_other_values, moved)) / _PROBE
+        changes = of_each(runs, partial(_of_another_value, _with_more(name, runs[0])))
         yield Suspect("fixed", name, "1", changes[..., None])
 
 
-def _of_other_values(moved: FloatArray, run: DisturbedRun) -> FloatArray:
-    """Change of the outputs by other parameters, in the rates and in what is seen of the states."""
-    rates = run.rates_of(run.model.derivative, moved) - run.rates
+def _with_more(name: str, run: DisturbedRun) -> FloatArray:
+    """The parameters (n_parameters,) of a run with a part more of the named one."""
+    vector = run.vector.copy()
+    vector[run.model.parameter_names.index(name)] *= 1.0 + _PROBE
+    return vector
+
+
+def _followed(moved: FloatArray, run: DisturbedRun) -> FloatArray:
+    """How rates (n_samples, n_states) follow parameters that are moved by a part of something."""
+    rates: FloatArray = (run.rates_of(run.model.derivative, moved) - run.rates) / _PROBE
+    return rates
+
+
+def _of_another_value(moved: FloatArray, run: DisturbedRun) -> FloatArray:
+    """Change of the outputs by moved parameters, in the rates and in what is seen of the states."""
     seen, before = (
         observed(run.model, run.states, run.record.inputs, values) for values in (moved, run.vector)
     )
-    return run.added(rates) + run.logged(seen - before)
+    return run.added(_followed(moved, run)) + run.logged((seen - before) / _PROBE)
 
 
 def rest_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
@@ -631,17 +640,14 @@ def _while_at_rest(u: int, j: int, run: DisturbedRun) -> FloatArray:
 
 def change_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Iterator[Suspect]:
     """Parameters, by name, that change in proportion to time from a record's begin to its end."""
-    model, vector = runs[0].model, runs[0].vector
     for name in names:
-        place, moved = model.parameter_names.index(name), vector.copy()
-        moved[place] *= 1.0 + _PROBE
-        changes = of_each(runs, partial(_drifting, moved))
+        changes = of_each(runs, partial(_drifting, _with_more(name, runs[0])))
         yield Suspect("change", name, "1", changes[..., None])
 
 
 def _drifting(moved: FloatArray, run: DisturbedRun) -> FloatArray:
     """Change by parameters that move by a part of what others differ by, in proportion to time."""
-    rates = (run.rates_of(run.model.derivative, moved) - run.rates) / _PROBE
+    rates = _followed(moved, run)
     return run.added(rates * np.linspace(-0.5, 0.5, len(rates))[:, None])
 
 
@@ -657,7 +663,7 @@ def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     for place, name in enumerate(model.parameter_names):
         moved = vector.copy()
         moved[place] += _PROBE * (vector[place] or 1.0)
-        terms = [(run.rates_of(model.derivative, moved) - run.rates) / _PROBE for run in runs]
+        terms = [_followed(moved, run) for run in runs]
         whole = np.concatenate(terms)
         if not (np.all(np.isfinite(whole)) and np.any(whole)):
             continue

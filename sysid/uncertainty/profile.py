@@ -117,7 +117,9 @@ def traced(
                 wanted[i] = searches[i][1].send(answer)  # type: ignore[arg-type]  # None begins it
             except StopIteration as end:
                 results[i] = end.value
-        made = _fitted([(searches[i][0], task) for i, task in wanted.items()]) if wanted else []
+        if not wanted:
+            break
+        made = _fitted([(searches[i][0], task) for i, task in wanted.items()])
         answers = dict(zip(wanted, made, strict=True))
         if fits is not None:
             fits += made
@@ -125,7 +127,7 @@ def traced(
 
 
 def _fitted(tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
-    """The best fits to places, by what one estimate was fitted by."""
+    """The best fits to places, of tracers around one estimate."""
     objective = tasks[0][0].objective
     descents = _begun(objective, tasks)
     ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
