@@ -50,7 +50,7 @@ class NoiseFit:
             assumed = assumed.eased(chromosome).weighed(weights)
             chromosome = refine(assumed, chromosome, on_iteration=self.watch).chromosome
         fitted = Innovations.starting(self.weighed, chromosome, **settings)
-        last = np.zeros(len(fitted.noise))
+        last = np.full(len(fitted.noise), np.inf)
         for _ in range(_ROUNDS):
             if not self.corrects and fitted.overwhelmed.any():
                 return None
@@ -58,7 +58,11 @@ class NoiseFit:
             if not np.isfinite(rms).all():  # a filter needs more steps here than there may be
                 break
             weighed = fitted.weighed(self.given.weights / (factors * np.maximum(rms, TINY)))
-            steady = np.allclose(weighed.weights, fitted.weights, rtol=_STEADY)
+            # Weights alone are steady by the noise of a poor place, too, where a filter corrects
+            # next to nothing; those of a single output always are.
+            steady = np.abs(last).max() < _STEADY and np.allclose(
+                weighed.weights, fitted.weights, rtol=_STEADY
+            )
             # Of no use to come to the end of what weights and noise will move.
             most, tolerance = (MOST_ITERATIONS, TOLERANCE) if steady else (QUICKLY, ROUGHLY)
             end = refine(
@@ -69,17 +73,15 @@ class NoiseFit:
                 on_iteration=self.watch,
             )
             chromosome, rms, fitted = end.chromosome, end.rms, weighed
-            if steady and not fitted.quiet:
-                break
-            if steady:
+            if not steady:
+                anew = fitted.settled(chromosome)
+            else:
                 # Where it began neither what bends nor what parabolas miss could be told well.
                 anew = fitted.renewed(chromosome).eased(chromosome)
                 alike = np.allclose(anew.noise, fitted.noise, rtol=_RENEWED)
                 if alike and fitted.exact == anew.exact:
                     break
-                fitted = anew
-            else:
-                fitted, last = towards(fitted, fitted.settled(chromosome), last)
+            fitted, last = towards(fitted, anew, last)
         return Optimum.of(fitted, chromosome, rms)
 
 

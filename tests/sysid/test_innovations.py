@@ -338,7 +338,7 @@ def test_the_bias_that_noise_of_an_input_brings_is_taken_away():
 
 
 def test_a_noisy_input_chooses_the_criterion():
-    (record, _) = noisy_records(1)
+    (record, _) = noisy_records(1, of_input=0.2)
     fit = GASSI(lag(), population=20, generations=2).fit(record)
     assert fit.criterion_ == "compensated"
     assert "u is measured with noise" in fit.criterion_reason_
@@ -748,6 +748,16 @@ def test_noise_of_an_output_is_what_its_samples_show_where_innovations_hardly_te
     # Of wrong parameters innovations contradict, and tell it themselves.
     wrong = Innovations.starting(objective, np.array([0.5 * GAIN, TAU]), corrects=True)
     assert wrong.noise > 0.05
+
+
+def test_noise_is_that_of_the_minimum_and_not_of_where_a_fit_begins():
+    """A poor place shows noise by which a filter hardly corrects; one output is all weight."""
+    record = next(noisy_records(1))
+    objective = Objective(BatchSimulator(lag(), accuracy=1e-4), SearchSpace.of(lag()), [record])
+    fit = NoiseFit(objective, objective, corrects=True)
+    near, far = (fit(np.array([part * GAIN, TAU])) for part in (1.0, 0.5))
+    assert far.objective.noise == pytest.approx(near.objective.noise, rel=1e-3)
+    assert far.chromosome == pytest.approx(near.chromosome, rel=1e-2)
 
 
 @pytest.mark.parametrize("answer", [-1.3, -1.0, -0.6, -0.2, 0.4])
