@@ -99,14 +99,20 @@ def test_tab_offers_what_can_stand_there(tmp_path, typed, offered, not_offered):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe")
     words = typed.split(" ")
     env = {"_RIG_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": f"{len(words) - 1}"}
-    # The shell completes the installed command, not ``python -m``.
-    script = Path(sysconfig.get_path("scripts")) / "rig"
-    result = subprocess.run(
-        [script], cwd=tmp_path, env=environment(**env), capture_output=True, text=True, check=False
-    )
+    result = rig(cwd=tmp_path, env=env)
     found = set(result.stdout.split())
     assert offered <= found and not found & not_offered
     assert result.stderr == ""
+
+
+def test_tab_completes_the_installed_command(tmp_path):
+    """A shell asks that one, and not ``python -m``."""
+    script = Path(sysconfig.get_path("scripts")) / "rig"
+    env = environment(_RIG_COMPLETE="complete_bash", COMP_WORDS="rig sch", COMP_CWORD="1")
+    result = subprocess.run(
+        [script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
+    assert (result.stdout.split(), result.stderr) == (["schema"], "")
 
 
 TABLE = """

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from tests.daq.support import rig
 from tests.examples.conftest import EXAMPLES
 
 
@@ -44,12 +43,11 @@ def test_the_tutorial_shows_the_example_as_it_is():
 
 @pytest.mark.soak
 def test_identification_finds_the_drive(data, tmp_path):
-    data.save(tmp_path / "training.csv", data.training()[:6000])
+    data.save(tmp_path / "training.csv", data.training()[:3000])
     data.save(tmp_path / "validation.csv", data.validation())
-    command = [sys.executable, "-m", "daq.cli", "identify", "training.csv", "--validate"]
-    command += ["validation.csv", "--config", str(EXAMPLES / "friction_drive.yaml")]
-    command += ["--population", "60", "--generations", "20", "--out", "found", "--json"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    command = ["identify", "training.csv", "--validate", "validation.csv", "--config"]
+    command += [EXAMPLES / "friction_drive.yaml", "--population", 60, "--generations", 20]
+    result = rig(*command, "--out", "found", "--json", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     found = {name: entry["value"] for name, entry in report["parameters"].items()}

@@ -73,11 +73,10 @@ def fitted(records, earlier=None, **settings):
 def test_a_search_ends_no_higher_than_the_minimum_beside_an_earlier_fit(records, process):
     alone = fitted(records, **process)
     assert alone.parameters_["first"] != pytest.approx(TRUTH["first"], abs=WIDTH)
-    for values in ([NEAR], [NEAR, FAR], [FAR, NEAR]):
-        for noise in ({}, {"y": NOISE}):
-            together = fitted(records, EarlierMinima(values, noise), **process)
-            for name, value in TRUTH.items():
-                assert together.parameters_[name] == pytest.approx(value, rel=0.1)
+    for values, noise in (([NEAR], {"y": NOISE}), ([NEAR, FAR], {}), ([FAR, NEAR], {"y": NOISE})):
+        together = fitted(records, EarlierMinima(values, noise), **process)
+        for name, value in TRUTH.items():
+            assert together.parameters_[name] == pytest.approx(value, rel=0.1)
 
 
 def test_nothing_is_searched_for_where_an_earlier_fit_is_settled(records):

@@ -14,6 +14,7 @@ from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.nudged import nudged
 from sysid.judging.examination import verdict_of
 from sysid.problem.space import SearchSpace
+from tests.soak import mostly_soak
 from tests.sysid.support import lag, prbs
 
 N = 12_000
@@ -206,7 +207,7 @@ def very_long_record():
     return Dataset(inputs, outputs + 1e-4 * rng.standard_normal((n, 1)), 0.01)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", mostly_soak([0, 1, 2]))
 def test_a_very_long_record_is_fitted_by_parts_however_it_swings(very_long_record, seed):
     estimator = GASSI(swing(), search_samples=4096, random_state=seed, **SETTINGS)
     estimator.fit(very_long_record)

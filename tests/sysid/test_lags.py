@@ -12,6 +12,7 @@ from benchmarks.stress import fitted
 from sysid import Dataset
 from sysid.judging.examination import verdict_of
 from sysid.judging.lags import Lag, lag_faults, lags
+from tests.soak import mostly_soak
 
 CASES = {case.name: case for case in cases()}
 
@@ -30,7 +31,9 @@ def test_a_lag_is_told_with_its_size(name, lag):
     assert lag in lags(training)
 
 
-@pytest.mark.parametrize("case", [*CORRECT, *MORE_CORRECT], ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case", mostly_soak([*CORRECT, *MORE_CORRECT], always=8), ids=lambda case: case.name
+)
 def test_channels_that_do_not_lag_are_let_alone(case):
     training, _ = case.records(0)
     assert lags(training) == ()

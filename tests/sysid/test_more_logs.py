@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import pytest
-
 from sysid import GASSI, Parameter
 from sysid.examples import lag_record
 from tests.sysid.support import lag
@@ -15,16 +13,15 @@ SENSE = Parameter("sense", "1", 1.0, 0.1, 10.0, "log")
 TAU = Parameter("tau", "s", 0.05, 0.005, 0.5, "log")
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_more_logs_never_determine_less(seed):
+def test_more_logs_never_determine_less():
     model = lag(
         parameters=(GAIN, SENSE, TAU),
         derivative=lambda x, u, p: ((p[0] * p[1] * u[0] - x[0]) / p[2],),
     )
-    records = [lag_record(seed=8 * seed + k) for k in range(8)]
+    records = [lag_record(seed=k) for k in range(8)]
     widths = []
     for n in (1, 2, 4, 8):
-        fit = GASSI(model, population=30, generations=8, random_state=seed).fit(records[:n])
+        fit = GASSI(model, population=30, generations=8, random_state=0).fit(records[:n])
         determined = {e.name: e.std for e in fit.uncertainty(records[:n]).determined()}
         assert sorted(determined) == ["gain sense", "tau"]
         widths.append(determined)
