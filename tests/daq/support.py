@@ -10,7 +10,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -135,9 +137,12 @@ def rig(*args, cwd, env=None, timeout=120, report=False, fresh=False, **options)
 
 
 def start_rig(*args, cwd, env=None, **options):
-    """Start ``rig`` and leave it running."""
+    """Start ``rig`` and leave it running: a Popen, or a Started where no options ask for more."""
+    words = _words(args, report=False)
+    if not options and hasattr(os, "fork"):
+        return _shared_server().start(words, cwd, env)
     return subprocess.Popen(
-        [*RIG, *_words(args, report=False)],
+        [*RIG, *words],
         cwd=cwd,
         env=environment(**(env or {})),
         stdout=subprocess.PIPE,
@@ -163,6 +168,12 @@ gc.freeze()  # so that no child looks through, and copies, what all share
 
 for line in sys.stdin:
     job = json.loads(line)
+    if "ended" in job:
+        child, status = os.waitpid(job["ended"], os.WNOHANG)
+        print(os.waitstatus_to_exitcode(status) if child else "", flush=True)
+        continue
+    # Before it is there: whoever reads what it says finds it open.
+    streams = [os.open(job[name], os.O_WRONLY | os.O_CREAT) for name in ("out", "err")]
     child = os.fork()
     if child == 0:
         # As in a terminal, whatever the tests themselves were started from.
@@ -174,8 +185,9 @@ for line in sys.stdin:
         os.environ.update(job["env"])
         sys.path[:0] = filter(None, job["env"].get("PYTHONPATH", "").split(os.pathsep))
         os.chdir(job["cwd"])
-        for number, name in ((0, os.devnull), (1, job["out"]), (2, job["err"])):
-            os.dup2(os.open(name, os.O_RDWR | os.O_CREAT), number)
+        for number, stream in enumerate((os.open(os.devnull, os.O_RDWR), *streams)):
+            os.dup2(stream, number)
+            os.close(stream)
         sys.argv = ["rig", *job["args"]]
         status = 0
         try:
@@ -188,14 +200,69 @@ for line in sys.stdin:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+    for stream in streams:
+        os.close(stream)
+    waits = job["timeout"] > 0
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) if waits else child, flush=True)
 """
 
 
+class Started:
+    """A ``rig`` process that runs, with what tests use of a Popen of texts."""
+
+    def __init__(self, server, pid, out, err):
+        self._server, self.pid, self.returncode = server, pid, None
+        self.stdout, self.stderr = out, err
+
+    def poll(self):
+        if self.returncode is None:
+            self.returncode = self._server.status(self.pid)
+        return self.returncode
+
+    def wait(self, timeout=None):
+        deadline = time.monotonic() + (timeout or 1e9)
+        while self.poll() is None:
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("rig", timeout)
+            time.sleep(0.005)
+        return self.returncode
+
+    def communicate(self, timeout=None):
+        """Rest of its output and of its errors, which others than it may hold open."""
+        readers = [ThreadPoolExecutor(1) for _ in range(2)]
+        pipes = self.stdout, self.stderr
+        texts = [pool.submit(pipe.read) for pool, pipe in zip(readers, pipes, strict=True)]
+        try:
+            out, err = (text.result(timeout) for text in texts)
+        except TimeoutError:
+            raise subprocess.TimeoutExpired("rig", timeout) from None
+        self.__exit__()
+        return out, err
+
+    def send_signal(self, number):
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self):
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self):
+        self.send_signal(signal.SIGKILL)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stdout.close()
+        self.stderr.close()
+        self.wait()
+
+
 class _Server:
-    """``rig`` processes without the seconds that each needs for its imports, one at a time."""
+    """``rig`` processes without the seconds that each needs for its imports."""
 
     def __init__(self):
+        self._lock = threading.Lock()
         self._folder = tempfile.TemporaryDirectory()
         self._process = subprocess.Popen(
             [sys.executable, "-c", _FORKING],
@@ -206,13 +273,37 @@ class _Server:
         out, err = Path(self._folder.name) / "out", Path(self._folder.name) / "err"
         out.unlink(missing_ok=True)
         err.unlink(missing_ok=True)
-        job = {"args": words, "cwd": str(cwd), "out": str(out), "err": str(err)}
-        job |= {"env": environment(**(env or {})), "timeout": timeout}
-        self._process.stdin.write(json.dumps(job) + "\n")
-        self._process.stdin.flush()
-        status = int(self._process.stdout.readline())
+        status = int(self._answer(words, cwd, env, out, err, timeout))
         assert status != -signal.SIGALRM, f"rig {words} has not ended within {timeout} s"
         return subprocess.CompletedProcess(words, status, out.read_text(), err.read_text())
+
+    def start(self, words, cwd, env=None):
+        """Begin one and leave it running: a Started, whose pipes are named for a moment."""
+        with tempfile.TemporaryDirectory() as folder:
+            pipes = [Path(folder) / name for name in ("out", "err")]
+            for pipe in pipes:
+                os.mkfifo(pipe)
+            # Not to wait for who writes to it, which comes with the answer.
+            ends = [os.open(pipe, os.O_RDONLY | os.O_NONBLOCK) for pipe in pipes]
+            pid = int(self._answer(words, cwd, env, *pipes, 0))
+        for end in ends:
+            os.set_blocking(end, True)
+        return Started(self, pid, *[os.fdopen(end, encoding="utf-8") for end in ends])
+
+    def status(self, pid):
+        """How a process has ended, None while it runs."""
+        answer = self._ask({"ended": pid})
+        return int(answer) if answer else None
+
+    def _answer(self, words, cwd, env, out, err, timeout):
+        job = {"args": words, "cwd": str(cwd), "out": str(out), "err": str(err)}
+        return self._ask(job | {"env": environment(**(env or {})), "timeout": timeout})
+
+    def _ask(self, job):
+        with self._lock:
+            self._process.stdin.write(json.dumps(job) + "\n")
+            self._process.stdin.flush()
+            return self._process.stdout.readline().strip()
 
     def close(self):
         self._process.stdin.close()

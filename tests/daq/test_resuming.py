@@ -3,20 +3,11 @@
 import re
 import shutil
 import signal
-import subprocess
 
 import pytest
 import yaml
 
-from tests.daq.support import (
-    RIG,
-    environment,
-    few_free,
-    rig,
-    until,
-    write_experiment,
-    write_yaml,
-)
+from tests.daq.support import few_free, rig, start_rig, until, write_experiment, write_yaml
 
 SIZE = ("--population", 80, "--generations", 120)
 
@@ -38,13 +29,6 @@ def few(tmp_path_factory):
     return "--config", write_yaml(tmp_path_factory.mktemp("settings") / "few.yaml", few_free())
 
 
-def begin(root, *args):
-    return subprocess.Popen(
-        [*RIG, "identify", *map(str, args)], cwd=root, env=environment(),
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-
-
 def parameters(folder):
     report = yaml.safe_load((folder / "parameters.yaml").read_text())
     return {key: value for key, value in report.items() if key != "software"}
@@ -56,7 +40,7 @@ def test_a_killed_identification_goes_on_to_the_same_result(captured, few, tmp_p
     root, folder = captured
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert rig("identify", folder, *few, *SIZE, "--out", whole, cwd=root).returncode == 0
-    process = begin(root, folder.relative_to(root), *few, *SIZE, "--out", cut)
+    process = start_rig("identify", folder.relative_to(root), *few, *SIZE, "--out", cut, cwd=root)
     checkpoint = cut / "search.ckpt"
     until(checkpoint.exists, "a checkpoint")
     first = checkpoint.stat().st_mtime_ns
@@ -75,7 +59,7 @@ def test_a_killed_identification_goes_on_to_the_same_result(captured, few, tmp_p
 def test_ctrl_c_says_how_to_go_on(captured, few, tmp_path):
     root, folder = captured
     out = tmp_path / "out"
-    process = begin(root, folder, *few, *SIZE[:-1], 5000, "--out", out)
+    process = start_rig("identify", folder, *few, *SIZE[:-1], 5000, "--out", out, cwd=root)
     until((out / "search.ckpt").exists, "a checkpoint")
     first = (out / "search.ckpt").stat().st_mtime_ns
     until(lambda: (out / "search.ckpt").stat().st_mtime_ns > first, "a later checkpoint")
@@ -102,7 +86,7 @@ def test_what_has_changed_meanwhile_is_named(captured, few, tmp_path):
     root, folder = captured
     log = tmp_path / "log.csv"
     shutil.copy(folder / "log.csv", log)
-    process = begin(root, log, *few, *SIZE, "--out", tmp_path / "o")
+    process = start_rig("identify", log, *few, *SIZE, "--out", tmp_path / "o", cwd=root)
     until((tmp_path / "o" / "search.ckpt").exists, "a checkpoint")
     process.kill()
     process.communicate()
