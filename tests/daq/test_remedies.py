@@ -261,17 +261,18 @@ def test_a_speed_in_other_units_is_a_guess_and_no_term_in_the_equations(tmp_path
 
 
 def test_a_position_starts_where_all_samples_say_and_commands_go_on_from_there(tmp_path):
-    log, model, notes = slide_log(3.0), slide_model(tmp_path), []
-    found = identify(log, model=model, watch=notes.append, initial={"v": 0.0})
+    log, notes = slide_log(3.0), []
+    quick = {"model": slide_model(tmp_path), "population": 40, "generations": 8}
+    found = identify(log, **quick, watch=notes.append, initial={"v": 0.0})
     assert any("where x starts is estimated" in getattr(note, "text", "") for note in notes)
     assert found.problem.settings.initial == {"v": 0.0, "x": "estimate"}
     assert abs(found.estimator.initial_states_[0]["x"]) < 0.01
     assert abs(found.parameters.loc["friction", "value"] - 3.0) < 0.1
-    again = identify(log, model=model, initial=found.problem.settings.initial)
+    again = identify(log, **quick, initial=found.problem.settings.initial)
     assert again.parameters.loc["friction", "value"] == pytest.approx(
         found.parameters.loc["friction", "value"], rel=1e-3
     )
-    kept = identify(log, model=model, watch=notes.append, initial={"x": "first"})
+    kept = identify(log, **quick, watch=notes.append, initial={"x": "first"})
     assert kept.estimator.initial_states_ == []
 
 
