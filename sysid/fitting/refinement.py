@@ -53,12 +53,14 @@ class Refinement:
     """Refined chromosome (n_free,), its error, and iterations taken.
 
     rms: (n_outputs,), the outputs' errors, infinite where it needs more steps than are allowed.
+    steps: integration steps per sample, for each record, that the error is by.
     """
 
     chromosome: FloatArray
     error: float
     rms: FloatArray
     iterations: int
+    steps: tuple[int, ...]
 
 
 def refine(
@@ -110,7 +112,7 @@ def refine_each(
     anew = iter(objective.rms(np.stack(lacking)) if lacking else ())
     rms = [next(anew) if p.accurate_rms is None else p.accurate_rms for p in points]
     return [
-        Refinement(end, descent.point.error, errors, descent.iterations)
+        Refinement(end, descent.point.error, errors, descent.iterations, descent.steps)
         for end, descent, errors in zip(ends, descents, rms, strict=True)
     ]
 

@@ -333,7 +333,7 @@ class _Analysis:
         self.local, self.ties, self.away = local, structure, away
         self.objective, self.space = local.objective, local.objective.space
         self.chromosome, self.coded = local.chromosome, self.space.encode(local.chromosome)
-        self.ridge = [Fit(0.0, 0.0, self.space.encode(point), local.error) for point in ridge]
+        self.ridge = [Fit(0.0, 0.0, self.space.encode(point), 0.0) for point in ridge]
         self.named = named_values(self.space, self.chromosome)
         self.on_bound = self.space.on_bound(self.chromosome)
         self.free = covariance(local, structure.directions)

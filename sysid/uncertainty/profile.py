@@ -76,12 +76,16 @@ def profile(objective: Objective, chromosome: FloatArray, name: str) -> Profile:
 
 
 class Fit(NamedTuple):
-    """A fit of all parameters to a place of a quantity: statistic, search coordinates, error."""
+    """A fit of all parameters to a place of a quantity.
+
+    at: (n_free,), search coordinates. loss: what its error is more than the estimate's by the same
+    integration steps, whose own errors may be larger than what is to be told.
+    """
 
     place: float
     statistic: float
     at: FloatArray
-    error: float
+    loss: float
 
     @property
     def root(self) -> float:
@@ -109,6 +113,7 @@ def traced(
     fits: is given all that were made on the way.
     """
     results: dict[int, _Result] = {}
+    least: dict[tuple[int, ...], float] = {}
     answers: dict[int, Fit | None] = dict.fromkeys(range(len(searches)))
     while answers:
         wanted: dict[int, Wanted] = {}
@@ -119,23 +124,31 @@ def traced(
                 results[i] = end.value
         if not wanted:
             break
-        made = _fitted([(searches[i][0], task) for i, task in wanted.items()])
+        made = _fitted([(searches[i][0], task) for i, task in wanted.items()], least)
         answers = dict(zip(wanted, made, strict=True))
         if fits is not None:
             fits += made
     return [results[i] for i in range(len(searches))]
 
 
-def _fitted(tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
-    """The best fits to places, of tracers around one estimate."""
-    objective = tasks[0][0].objective
-    descents = _begun(objective, tasks)
-    ends = np.stack([end.chromosome for end in refine_each(objective, descents, _ITERATIONS)])
-    errors, coded = objective.evaluate(ends)[0].tolist(), objective.space.encode(ends)
-    return [
-        Fit(wanted.place, tracer.statistic(error), at, error)
-        for (tracer, wanted), error, at in zip(tasks, errors, coded, strict=True)
-    ]
+def _fitted(
+    tasks: Sequence[tuple["Tracer", Wanted]], least: dict[tuple[int, ...], float]
+) -> list[Fit]:
+    """The best fits to places, of tracers around one estimate.
+
+    least: errors of the estimate by integration steps, those that are met are added.
+    """
+    objective, estimate = tasks[0][0].objective, tasks[0][0].local.chromosome
+    ends = refine_each(objective, _begun(objective, tasks), _ITERATIONS)
+    for steps in {end.steps for end in ends if np.isfinite(end.error)} - least.keys():
+        rms = objective.residuals(estimate[None], steps, keep=False).rms
+        least[steps] = float(objective.error_of(rms)[0])
+    fits = []
+    for (tracer, wanted), end in zip(tasks, ends, strict=True):
+        loss = end.error - least.get(end.steps, 0.0)
+        at = objective.space.encode(end.chromosome)
+        fits.append(Fit(wanted.place, tracer.statistic(loss), at, loss))
+    return fits
 
 
 def _begun(objective: Objective, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Descent]:
@@ -163,10 +176,10 @@ class Tracer:
         gradient: FloatArray,
         quantity: Profiled,
     ) -> None:
-        self.quantity, self.start = quantity, local.objective.space.encode(local.chromosome)
+        self.local, self.quantity = local, quantity
+        self.start = local.objective.space.encode(local.chromosome)
         self.objective = objective = local.criterion
         self.centre = quantity.at(self.start)
-        self.error = local.error
         deviation = covariance.deviation(gradient)
         self.unit = deviation if np.isfinite(deviation) else _BLIND_SHARE * quantity.width
         # Statistic per loss of error.
@@ -178,7 +191,7 @@ class Tracer:
         # Next to zero a logarithm's deviation is no measure.
         near = min(self.unit, _BLIND_SHARE * quantity.width)
         self.stiffness = float(np.sqrt(2.0 * _TETHER * scale) / near)
-        loss = 1.0 / (self.factor * max(self.error, 1e-300))  # share of the error
+        loss = 1.0 / (self.factor * max(local.error, 1e-300))  # share of the error
         self.tolerance = float(np.clip(_RESOLUTION * loss, 1e-7, 1e-3))
         # How the others go with the quantity where the slopes at the estimate are a guide.
         along = covariance.matrix @ gradient if np.isfinite(deviation) else gradient
@@ -188,7 +201,7 @@ class Tracer:
     def side(self, sign: float) -> Search[list[tuple[float, float]]]:
         """Places and statistics on one side, outwards until well beyond the 95 % level."""
         end = self._end(sign)
-        before = last = self._at_centre
+        fits = [self._at_centre]
         points: list[tuple[float, float]] = []
         for step in _STEPS:
             place = self.centre + sign * step * self.unit
@@ -196,9 +209,9 @@ class Tracer:
             place = end if beyond else place
             if place == self.centre:
                 break
-            before, last = last, (yield self._wanted(place, last, before))
-            points.append((place, last.statistic))
-            if beyond or last.statistic > 1.5 * Z95**2:
+            fits.append((yield self._wanted(place, fits)))
+            points.append((place, fits[-1].statistic))
+            if beyond or fits[-1].statistic > 1.5 * Z95**2:
                 break
         return points
 
@@ -208,20 +221,22 @@ class Tracer:
         begin: a fit on that side, below the level, that the search goes on from.
         """
         end = self._end(sign)
-        before = inside = begin or self._at_centre
+        inside = begin or self._at_centre
         outside: Fit | None = None
+        fits = [self._at_centre, inside] if begin else [inside]
         if sign * (end - inside.place) <= 0.0:
             return None
         beyond = halve = False
         for _ in range(_REFITS):
             place = self._next(sign, end, inside, outside, halve=halve)
-            fit = yield self._wanted(place, inside, before)
+            fit = yield self._wanted(place, fits)
+            fits.append(fit)
             repeated = outside is not None and place == outside.place
             halve, beyond = beyond == (fit.statistic > Z95**2), fit.statistic > Z95**2
             if beyond:
                 outside = fit
             else:
-                before, inside, outside = inside, fit, None if repeated else outside
+                inside, outside = fit, None if repeated else outside
                 if place == end:
                     return None
             if outside is not None and (repeated or abs(fit.root - Z95) < _NEAR):
@@ -254,13 +269,13 @@ class Tracer:
         share = 0.5 if halve else _share(inside, outside)
         return inside.place + share * (outside.place - inside.place)
 
-    def statistic(self, error: float) -> float:
-        """Twice the loss of log-likelihood by an error."""
-        return max(0.0, self.factor * (error - self.error))
+    def statistic(self, loss: float) -> float:
+        """Twice the loss of log-likelihood by a loss of error."""
+        return max(0.0, self.factor * loss)
 
     def as_seen(self, fit: Fit) -> Fit:
         """A fit that was made for another quantity, by this one's place and statistic."""
-        return fit._replace(place=self.quantity.at(fit.at), statistic=self.statistic(fit.error))
+        return fit._replace(place=self.quantity.at(fit.at), statistic=self.statistic(fit.loss))
 
     def begun(self, place: float, at: FloatArray) -> Descent:
         """A descent to a place from search coordinates (n_free,), or the nearest possible."""
@@ -279,14 +294,26 @@ class Tracer:
 
     @property
     def _at_centre(self) -> Fit:
-        return Fit(self.centre, 0.0, self.start, self.error)
+        return Fit(self.centre, 0.0, self.start, 0.0)
 
-    def _wanted(self, place: float, last: Fit, before: Fit) -> Wanted:
-        """A fit to a place, from where the last two and the way between them lead."""
-        way = self.direction
-        if last.place != before.place:
-            way = (last.at - before.at) / (last.place - before.place)
-        return Wanted(place, (last.at + (place - last.place) * way, last.at))
+    def _wanted(self, place: float, fits: Sequence[Fit]) -> Wanted:
+        """A fit to a place, from where fits near it lead: one, the way between two, three."""
+        nodes: list[Fit] = []
+        for fit in sorted(fits, key=lambda fit: abs(fit.place - place)):
+            if np.isfinite(fit.statistic) and fit.place not in [node.place for node in nodes]:
+                nodes.append(fit)
+        near = [nodes[0].at, nodes[0].at + (place - nodes[0].place) * self.direction]
+        near += [_led(place, nodes[:n]) for n in (2, 3) if len(nodes) >= n]
+        return Wanted(place, tuple(near))
+
+
+def _led(place: float, nodes: Sequence[Fit]) -> FloatArray:
+    """Search coordinates (n_free,) at a place on the polynomial through those of fits."""
+    at = np.zeros_like(nodes[0].at)
+    for node in nodes:
+        others = [n.place for n in nodes if n is not node]
+        at += node.at * np.prod([(place - o) / (node.place - o) for o in others])
+    return at
 
 
 def _share(inside: Fit, outside: Fit) -> float:
