@@ -16,10 +16,12 @@ from sysid.fitting.objective import FLOORS, Objective
 from sysid.fitting.quadratic import FIRST_DAMPING, heavier
 from sysid.problem.space import SearchSpace
 
-# Sizes of the perturbations, in parts of the ranges. The first is for what is smooth. Where
-# something switches (dry friction, an overflow) the instant of switching moves in steps of the
-# integration, and only a larger perturbation shows what it depends on.
-PERTURBATIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+# Sizes of the perturbations, in parts of the ranges. The first is for what is smooth: where
+# parameters are nearly tied their slopes all but cancel along the valley, so that neither their
+# change within the perturbation nor rounding may count. Where something switches (dry friction, an
+# overflow) the instant of switching moves in steps of the integration, and only a larger
+# perturbation shows what it depends on.
+PERTURBATIONS = (1e-8, 1e-5, 1e-4, 1e-3, 1e-2)
 TOLERANCE = 1e-7  # share of the error that ends a descent where nothing else is said
 PATIENCE = 3  # failures in a row, the later ones with more damping
 NOTHING = 1e-3  # share of the error that is not worth a change of perturbations

@@ -21,6 +21,10 @@ parameters", Journal of the SIAM 11, 1963)
 between the bounds of the ranges; one that would cross constraints slides along them. What the
 quadratic promises to gain is the share -(g'd + d'H d / 2) / E_f. Steps and slopes are in parts of
 the ranges.
+
+Between parameters that are nearly tied diag H is that of a valley's walls, and damping by it turns
+a step away from the valley before it shortens it. So a part of the undamped step is tried as well,
+and, where nothing gains what is promised, lengths of it that are bent with the valley.
 """
 
 from __future__ import annotations
@@ -37,10 +41,13 @@ from sysid.problem.space import SearchSpace
 
 # The values of lambda that are tried, in parts of the middle one.
 _FACTORS = 5.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-CANDIDATES = len(_FACTORS)
 FIRST_DAMPING = 1e-2
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
 _HOLDING_ROUNDS = 4  # in which the coordinates that hit a bound are held there
+_PART = 0.1  # of the undamped step, which tells how the valley bends
+_LENGTHS = np.array([1.0, 0.5, 0.25, 0.1, 0.03])  # of the undamped step, bent
+# Simulations of candidates that an iteration takes, straight and bent ones.
+CANDIDATES = 2 * len(_FACTORS) + 1 + len(_LENGTHS)
 _PERTURBATION = 1e-6  # of constraints, in parts of the ranges
 # A slide ends this far inside, in parts of the constraint's slope: on it rounding would decide.
 _MARGIN = 1e-6
@@ -103,19 +110,20 @@ def _summed(
 class Candidates:
     """Coordinates that may follow a point, (n, n_free), and the middle lambda then, (n,).
 
-    promise: share of the error that the quadratic's own minimum would take away.
+    promise: share of the error that the quadratic's own minimum would take away. undamped: whether
+    the last one is part of the way to that minimum.
     """
 
     coordinates: FloatArray
     damping: FloatArray
     promise: float
+    undamped: bool = False
 
     def joined(self, more: Candidates) -> Candidates:
-        """These and more of the same point."""
+        """These and more of the same point, of which none is told apart any more."""
         coordinates = np.concatenate([self.coordinates, more.coordinates])
-        return replace(
-            self, coordinates=coordinates, damping=np.concatenate([self.damping, more.damping])
-        )
+        damping = np.concatenate([self.damping, more.damping])
+        return replace(self, coordinates=coordinates, damping=damping, undamped=False)
 
 
 def candidates(
@@ -160,8 +168,12 @@ def candidates(
     promises = gained / np.array([quadratic.error for quadratic in quadratics])[:, None]
     kept = (~beyond & (promises > 0.0))[:, :-1]
     lighter = np.clip(lambdas / np.sqrt(_FACTORS[-1]), _LEAST_DAMPING, _MOST_DAMPING)
+    # A part of the undamped step after those that are damped, which leaves lambda as it is.
+    undamped = ~beyond[:, -1] & (promises[:, -1] > 0.0) & kept.any(axis=1)
+    coordinates[:, -1], lighter[:, -1] = at[:, 0] + _PART * steps[:, -1] * width, damping
+    kept = np.column_stack([kept, undamped])
     return [
-        Candidates(coordinates[k, :-1][kept[k]], lighter[k, :-1][kept[k]], promise)
+        Candidates(coordinates[k][kept[k]], lighter[k][kept[k]], promise, bool(undamped[k]))
         for k, promise in enumerate(promises.max(axis=1).tolist())
     ]
 
@@ -179,7 +191,8 @@ def bent(
     responses: those around the point, and those of the candidates. With s_j = e_j(d) - e_j - J_j d
     a step d goes on by the solution of (H + lambda D) b = -sum_j c_j J_j' s_j (Transtrum & Sethna,
     "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization",
-    arXiv:1201.5885, by a finite step). In a narrow valley that bends, straight steps are short.
+    arXiv:1201.5885, by a finite step). In a narrow valley that bends, straight steps are short. Along
+    the undamped step s grows with the square of the length: t d goes on by t^2 b.
     """
     around, ends = responses
     space, (lower, upper) = objective.space, bounds
@@ -194,15 +207,23 @@ def bent(
     diagonal = np.diag(quadratic.hessian)
     scale = np.maximum(diagonal, 1e-12 * diagonal.max())
     added = np.sqrt(_FACTORS[-1]) * offer.damping[:, None] * scale
+    if offer.undamped:
+        added[-1] = _LEAST_DAMPING * scale
     free = (offer.coordinates > lower) & (offer.coordinates < upper)
     systems = np.where(free[:, :, None] & free[:, None], quadratic.hessian, 0.0)
     places = np.arange(len(at))
     systems[:, places, places] += np.where(free, added, 1.0)
     moves = _solved(systems, np.where(free, -slopes, 0.0))
-    coordinates = np.clip(offer.coordinates + moves * space.width, lower, upper)
+    coordinates, damping = offer.coordinates + moves * space.width, offer.damping
+    if offer.undamped:
+        t = _LENGTHS[:, None] / _PART
+        lengths = at + t * (offer.coordinates[-1] - at) + t**2 * moves[-1] * space.width
+        coordinates = np.concatenate([coordinates[:-1], lengths])
+        damping = np.append(damping[:-1], np.full(len(lengths), damping[-1]))
+    coordinates = np.clip(coordinates, lower, upper)
     kept = np.flatnonzero(np.isfinite(coordinates).all(axis=1))
     kept = kept[~_infeasible(space, coordinates[kept])]
-    return replace(offer, coordinates=coordinates[kept], damping=offer.damping[kept])
+    return replace(offer, coordinates=coordinates[kept], damping=damping[kept], undamped=False)
 
 
 def heavier(damping: float) -> float:

@@ -5,8 +5,9 @@ An iteration of a descent at x, in search coordinates, takes two or three batche
     1. x and its neighbours x + h_k e_k give the quadratic around x (see ``quadratic``): its
        Hessian H, slope g, and the share of the error that it promises to take away.
     2. Candidates x + d(lambda), (H + lambda D) d = -g, of five values of lambda around the last
-       one. The best is the next x if it gains anything; lambda falls to a fifth of its own then,
-       and rises 625-fold if none gains.
+       one, and a part of the undamped step. The best is the next x if it gains anything; lambda
+       falls to a fifth of its own then, and rises 625-fold if none gains.
+    3. Where none gains half of what the quadratic promises, the same bent with the valley.
 
 Integration steps are chosen for x, are the same for all that is simulated around it, so that
 differences are those of the parameters alone, and are chosen anew when x has moved far. A descent
@@ -146,7 +147,7 @@ def errors_of(objective: Objective, descents: Sequence[Descent]) -> FloatArray:
 
 def simulations_per_iteration(objective: Objective) -> int:
     """Most simulations that an iteration of one descent takes."""
-    return 3 + len(objective.space.parameters) + 2 * CANDIDATES
+    return 3 + len(objective.space.parameters) + CANDIDATES
 
 
 def curvature(objective: Objective, at: FloatArray) -> FloatArray:
