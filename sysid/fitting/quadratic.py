@@ -191,8 +191,8 @@ def bent(
     responses: those around the point, and those of the candidates. With s_j = e_j(d) - e_j - J_j d
     a step d goes on by the solution of (H + lambda D) b = -sum_j c_j J_j' s_j (Transtrum & Sethna,
     "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization",
-    arXiv:1201.5885, by a finite step). In a narrow valley that bends, straight steps are short. Along
-    the undamped step s grows with the square of the length: t d goes on by t^2 b.
+    arXiv:1201.5885, by a finite step). In a narrow valley that bends, straight steps are short.
+    Along the undamped step s grows with the square of the length: t d goes on by t^2 b.
     """
     around, ends = responses
     space, (lower, upper) = objective.space, bounds
