@@ -84,7 +84,8 @@ class Descent:
     iterations in a row that gained nothing, or hardly any of what was promised. level: of
     ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
     smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the
-    other side, because simulations fail on the usual one.
+    other side, because simulations fail on the usual one. cautious: whether all steps are damped,
+    since one has led to where simulations fail.
     """
 
     point: Point
@@ -101,6 +102,7 @@ class Descent:
     iterations: int = 0
     finished: bool = False
     backward: tuple[int, ...] = ()
+    cautious: bool = False
     tolerance: float = TOLERANCE
     restriction: Restriction = FREE
 
@@ -139,6 +141,7 @@ def retreat(_: Objective, descent: Descent) -> Descent | None:
         failures=failures,
         iterations=descent.iterations + 1,
         finished=failures >= PATIENCE,
+        cautious=True,
     )
 
 

@@ -119,6 +119,12 @@ class Candidates:
     promise: float
     undamped: bool = False
 
+    @property
+    def damped(self) -> Candidates:
+        """Those of damped steps."""
+        n = len(self.coordinates) - self.undamped
+        return Candidates(self.coordinates[:n], self.damping[:n], self.promise)
+
     def joined(self, more: Candidates) -> Candidates:
         """These and more of the same point, of which none is told apart any more."""
         coordinates = np.concatenate([self.coordinates, more.coordinates])

@@ -189,7 +189,7 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     offers = {}
     for i, offer in zip(quadratics, offered, strict=True):
         if len(offer.coordinates) and not offer.promise <= onward[i].tolerance:
-            offers[i] = offer
+            offers[i] = offer.damped if onward[i].cautious else offer
         else:
             onward[i] = resumed(objective, onward[i], "arrived")
     rows = [offer.coordinates for offer in offers.values()]

@@ -658,7 +658,7 @@ def test_a_valley_that_turns_back_is_followed_behind_its_turn(seed, begun):
 def test_where_a_descent_stops_in_a_bent_valley_matters_to_no_interval(begun):
     objective = feedback(0.02, 4).objective()
     minimum, stopped = (
-        refine(objective, np.array(begun), max_iterations=most).chromosome for most in (300, 8)
+        refine(objective, np.array(begun), max_iterations=most).chromosome for most in (300, 3)
     )
     k = estimates(uncertainty(objective, stopped))["k"]
     assert abs(stopped[0] - minimum[0]) > 0.1
@@ -666,7 +666,7 @@ def test_where_a_descent_stops_in_a_bent_valley_matters_to_no_interval(begun):
 
 
 def test_a_descent_along_a_bent_valley_comes_to_its_end():
-    objective = feedback(0.002, 4).objective()
+    objective = feedback(0.0005, 4).objective()
     begun = np.array([0.15, 0.2])
     end = refine(objective, begun, max_iterations=1000)
     assert end.iterations > MOST_ITERATIONS
