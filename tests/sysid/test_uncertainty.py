@@ -654,6 +654,54 @@ def test_a_valley_that_turns_back_is_followed_behind_its_turn(seed, begun):
     assert Z * deviation > 0.95 * np.log(b.value / 0.04)
 
 
+class Laddered(Formula):
+    """One step a sample above a gain, two below it, whose own errors are like a fiftieth of noise.
+
+    So they change twice the log-likelihood by n / 25 at once, but no slope.
+    """
+
+    def __init__(self, model, formula, above, noise):
+        super().__init__(model, formula)
+        self.above, self.noise = above, noise
+
+    def steps_of_each(self, vectors, record):
+        return np.where(vectors[:, 0] > self.above, 1, 2)
+
+    def trajectories(self, vectors, record, n_steps=None, starts=None):
+        outputs = super().trajectories(vectors, record, n_steps, starts)
+        outputs[n_steps == 1] += 0.02 * self.noise
+        return outputs
+
+
+@pytest.mark.parametrize("share", [-0.5, 0.5])
+def test_errors_of_the_integration_steps_are_no_loss_of_likelihood(share):
+    rng = np.random.default_rng(5)
+    u = rng.standard_normal((400, 1))
+    noise = rng.standard_normal((400, 1))
+    noise -= u * (u.T @ noise) / (u.T @ u)
+    model = lag(
+        parameters=(unknown("gain", 2.0, "linear"),),
+        derivative=lambda x, u, p: (p[0] * u[0] - x[0],),
+    )
+    deviation = float(np.sqrt(np.mean(noise**2) / np.sum(u**2)))
+    simulator = Laddered(model, lambda p, u: p["gain"] * u, 2.0 + share * deviation, noise)
+    record = Dataset(u, 2.0 * u + noise, 0.01)
+    objective = Objective(simulator, SearchSpace.of(model), [record])
+    ends = profile(objective, np.array([2.0]), "gain")
+    expected = 2.0 + Z * deviation * np.array([-1, 1])
+    np.testing.assert_allclose((ends.low, ends.high), expected, rtol=1e-3)
+
+
+def test_few_steps_lead_along_a_narrow_valley_that_bends():
+    """b = k (1.4 - k), in which k is known to a hundredth; damped steps alone are 60."""
+    formula = feedback(1e-3, 4).formula
+    parameters = [unknown("k", 1.0), unknown("b", 0.4)]
+    objective = Problem(formula, parameters, sigma=1e-4, inputs=2, seed=4).objective()
+    end = refine(objective, np.array([0.3, 0.33]), max_iterations=200)
+    np.testing.assert_allclose(end.chromosome, [1.0, 0.4], rtol=0.01)
+    assert end.iterations < 40
+
+
 @pytest.mark.parametrize("begun", [(0.3, 0.33), (0.15, 0.2)])
 def test_where_a_descent_stops_in_a_bent_valley_matters_to_no_interval(begun):
     objective = feedback(0.02, 4).objective()
