@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import tempfile
+import zlib
 from pathlib import Path
 
 from hypothesis import settings
@@ -39,7 +40,13 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-def pytest_collection_modifyitems(items):
+def pytest_report_header():
+    part = os.environ.get("RIG_LONG_TESTS")
+    return f"long tests: part {part}" if part else None
+
+
+def pytest_collection_modifyitems(config, items):
+    _leave_out_other_parts(config, items)
     # The longest begin first, so that no process waits for one alone at the end.
     longest = [
         "test_tutorial", "test_missing_physics", "test_characterising", "test_cli",
@@ -57,6 +64,21 @@ def pytest_collection_modifyitems(items):
         return next((n for n, name in enumerate(longest) if f"{name}.py" in path), len(longest))
 
     items.sort(key=place)
+
+
+def _leave_out_other_parts(config, items):
+    """Of the long tests RIG_LONG_TESTS=1/4 keeps the second of four parts, which together are all.
+
+    Cases of a test stay together: they share what they prepare.
+    """
+    part, of = map(int, os.environ.get("RIG_LONG_TESTS", "0/1").split("/"))
+
+    def elsewhere(item):
+        test = item.nodeid.partition("[")[0].encode()
+        return item.get_closest_marker("soak") is not None and zlib.crc32(test) % of != part
+
+    config.hook.pytest_deselected(items=[item for item in items if elsewhere(item)])
+    items[:] = [item for item in items if not elsewhere(item)]
 
 
 def _import_from_other_ends(worker):
