@@ -27,7 +27,7 @@ from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, better_by_filter
-from sysid.gassi.lookalikes import lookalikes
+from sysid.gassi.lookalikes import hardly_felt, lookalikes
 from sysid.gassi.noise_fit import NoiseFit, foresees_more, too_well
 from sysid.gassi.optima import (
     LEAST_SHARE,
@@ -200,17 +200,20 @@ def _explored(
     """Minima (n_free,) refined by likelihood, and those that look like the best.
 
     Without lookalikes the first is the best, and the others are refined as long as they may be it.
+    Those that differ in what is hardly felt are looked for unless it is done roughly.
     """
     optima = Optima(objective)
     for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
     explored = None
-    for _ in range(_EXPLORED if lookalike else 1):
+    for _ in range(1 if roughly and not lookalike else _EXPLORED):
         best = optima.ranked()[0]
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break  # nothing better was found around it
+        starts = [] if lookalike or explored else [*minima[1:]]
+        starts += lookalikes(best.objective, best.chromosome) if lookalike else []
+        starts += [] if roughly else hardly_felt(best.objective, best.chromosome)
         explored = best
-        starts = lookalikes(best.objective, best.chromosome) if lookalike else minima[1:]
         # By the best one's weights, until it turns out to matter.
         for end in _conceivable(best.objective, starts, optima, best):
             if optima.new(end.chromosome):

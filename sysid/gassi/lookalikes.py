@@ -10,6 +10,8 @@ Where a model's states come to an end of a range, such as an amplifier's supply,
 they do not tell elsewhere. At parameters with which that end is just not reached, or just is, the
 error has a kink, on which noise makes a minimum of its own: what is better beyond it is found along
 the directions that a model without ends leaves undetermined.
+
+And what is hardly felt may have several minima in the noise of what is felt more.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ _REACH = 2.0  # times that aliases may be faster or slower than the mode
 _MOST_ALIASES = 6
 _STAGES, _ITERATIONS = 3, 2  # on the way to the alias, Newton steps at each
 _HARM = 2.0  # times the error that starts may have which are no more than worth a try
+_LITTLE = 1.3  # the same of starts with one parameter moved
 _TURNED = 3  # parameters that are moved to find twins
 _TURNS = (-0.3, -0.15, 0.15, 0.3)  # by these parts of their ranges
 _DIFFERENCE = 1e-6
@@ -82,6 +85,23 @@ def _beyond_ends(objective: Objective, chromosome: FloatArray) -> list[FloatArra
             as_good = np.flatnonzero(errors[1:] <= (1.0 + _SAME) * best)
             starts.append(rows[as_good[len(as_good) // 2]])
     return starts
+
+
+def hardly_felt(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
+    """Chromosomes with one parameter moved, where that adds little to the error.
+
+    What is hardly felt among other things' noise may have minima side by side, as a winding's and
+    its driver's lag where a log is not made for them; the search has seen none of them.
+    """
+    space = objective.space
+    at, n = space.encode(chromosome), len(space.index)
+    moves = np.outer(_TURNS, np.ones(n))[:, :, None] * np.eye(n, len(at)) * space.width
+    rows = (at + moves).reshape(-1, len(at))
+    lower, upper = space.coded_bounds
+    inside = np.all((rows >= lower) & (rows <= upper), axis=1)
+    moved = space.decode(rows[inside])
+    errors, _ = objective.evaluate(np.stack([chromosome, *moved]))
+    return list(moved[errors[1:] < _LITTLE * errors[0]])
 
 
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
