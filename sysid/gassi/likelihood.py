@@ -125,7 +125,10 @@ def fit_likelihood(
     roughly = noise == "innovations"
     lookalike = not (explored or begun.is_settled or roughly)
     minima = minima if roughly else [*minima, *begun.chromosomes]
-    optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=roughly)
+    beside = not (begun.is_settled or roughly)
+    optima = _explored(
+        objective, minima, watch, lookalike=lookalike, beside=beside, roughly=roughly
+    )
     if not roughly:
         objective, optima = _in_noise(objective, optima, watch)
     best, *others = optima.ranked()
@@ -195,24 +198,25 @@ def _explored(
     watch: Watch | None,
     *,
     lookalike: bool,
+    beside: bool = False,
     roughly: bool = False,
 ) -> Optima:
     """Minima (n_free,) refined by likelihood, and those that look like the best.
 
     Without lookalikes the first is the best, and the others are refined as long as they may be it.
-    Those that differ in what is hardly felt are looked for unless it is done roughly.
+    beside: whether those are looked for that differ in what is hardly felt.
     """
     optima = Optima(objective)
     for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
     explored = None
-    for _ in range(1 if roughly and not lookalike else _EXPLORED):
+    for _ in range(_EXPLORED if lookalike or beside else 1):
         best = optima.ranked()[0]
         if explored is not None and optima.deviance(explored, best) < _BETTER:
             break  # nothing better was found around it
         starts = [] if lookalike or explored else [*minima[1:]]
         starts += lookalikes(best.objective, best.chromosome) if lookalike else []
-        starts += [] if roughly else hardly_felt(best.objective, best.chromosome)
+        starts += hardly_felt(best.objective, best.chromosome) if beside else []
         explored = best
         # By the best one's weights, until it turns out to matter.
         for end in _conceivable(best.objective, starts, optima, best):

@@ -22,7 +22,8 @@ DT, NOISE, WIDTH = 0.01, 0.01, 0.015
 TRUTH = {"first": 0.62, "second": 0.37, "tau": 0.05}
 NEAR = {"first": 0.623, "second": 0.368, "tau": 0.06}
 FAR = {"first": 0.3, "second": 0.8, "tau": 0.2}
-FEW = {"population": 6, "generations": 2}  # too few to come upon so small a place
+# Too few, and begun too far away, to come upon so small a place.
+FEW = {"population": 6, "generations": 2, "random_state": 1}
 
 
 def acting(u, first, second):
