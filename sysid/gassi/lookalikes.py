@@ -45,7 +45,7 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     """Chromosomes (n_free,) in the ranges of which a fast mode is this one's or an alias of it."""
     fastest, dt = _Modes(objective, chromosome), objective.records[0].dt
     swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
-    starts = _harmless(objective, chromosome, [*swapped, *alike])
+    starts = _harmless(objective, chromosome, [*swapped, *alike], _HARM)
     starts += _beyond_ends(objective, chromosome)
     for modes in (fastest, *fastest.others(2.0 * np.pi * _FASTEST_SEEN / dt)):
         starts += [*_twins(modes), *_aliases(modes, dt)]
@@ -53,9 +53,9 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
 
 
 def _harmless(
-    objective: Objective, chromosome: FloatArray, starts: list[FloatArray]
+    objective: Objective, chromosome: FloatArray, starts: list[FloatArray], harm: float
 ) -> list[FloatArray]:
-    """Those of some starts (n_free,) in the ranges whose error is no multiple of a chromosome's."""
+    """Starts (n_free,) in the ranges whose error is less than so many times a chromosome's."""
     rows = np.stack([chromosome, *starts])
     coded = objective.space.encode(
         np.maximum(rows, np.finfo(np.float64).tiny * objective.space.log)
@@ -63,7 +63,7 @@ def _harmless(
     lower, upper = objective.space.coded_bounds
     admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
     errors, _ = objective.evaluate(np.where(admitted[:, None], rows, chromosome))
-    kept = admitted & (errors < _HARM * errors[0])
+    kept = admitted & (errors < harm * errors[0])
     return list(rows[1:][kept[1:]])
 
 
@@ -93,15 +93,14 @@ def hardly_felt(objective: Objective, chromosome: FloatArray) -> list[FloatArray
     What is hardly felt among other things' noise may have minima side by side, as a winding's and
     its driver's lag where a log is not made for them; the search has seen none of them.
     """
-    space = objective.space
-    at, n = space.encode(chromosome), len(space.index)
-    moves = np.outer(_TURNS, np.ones(n))[:, :, None] * np.eye(n, len(at)) * space.width
-    rows = (at + moves).reshape(-1, len(at))
-    lower, upper = space.coded_bounds
-    inside = np.all((rows >= lower) & (rows <= upper), axis=1)
-    moved = space.decode(rows[inside])
-    errors, _ = objective.evaluate(np.stack([chromosome, *moved]))
-    return list(moved[errors[1:] < _LITTLE * errors[0]])
+    space, starts = objective.space, []
+    for turn in _TURNS:
+        moved = space.decode(space.encode(chromosome) + turn * space.width)
+        for place in range(len(space.index)):
+            start = chromosome.copy()
+            start[place] = moved[place]
+            starts.append(start)
+    return _harmless(objective, chromosome, starts, _LITTLE)
 
 
 def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
