@@ -54,38 +54,46 @@ def best_alternative(
 ) -> Alternative | None:
     """The surest variant among findings, fitted with the settings of an estimator.
 
-    Without one, the model with the surest function that moves its parameters. None where there is
-    neither, or none of its simulations succeeds.
+    Or a simpler one that it contains, where that has the lower BIC: a function of speed and angle
+    explains what one of speed alone does. Without a variant, the model with the surest function
+    that moves its parameters. None where there is neither, or none of its simulations succeeds.
     """
-    from sysid.gassi import GASSI
-
     if estimator.model is None:
         return None
-    suspected = _surest(findings, estimator.model)
-    if suspected is None:
+    suspected = _suspected(findings, estimator.model)
+    fitted = {name: _fitted(estimator, model, training) for name, model, _ in suspected}
+    estimators = {name: e for name, e in fitted.items() if e is not None}
+    if not estimators:
         return None
-    name, variant, terms = suspected
-    settings = {**estimator.get_params(deep=False), "model": variant}
-    try:
-        fitted = GASSI(**settings).fit(list(training))
-    except ModelError:
-        return None
-    pair = [(_MODEL, estimator), (name, fitted)]
-    candidates = [Candidate.of(name, e, training, validation) for name, e in pair]
-    comparison = compare(candidates, training, validation)
+    pairs = [(_MODEL, estimator), *estimators.items()]
+    candidates = {name: Candidate.of(name, e, training, validation) for name, e in pairs}
+    comparison = compare(list(candidates.values()), training, validation)
     rows = {row.name: row for row in comparison.rows}
+    name = min(estimators, key=lambda n: (not rows[n].good, rows[n].dbic))
     better = rows[_MODEL].dbic - rows[name].dbic > _STRONG and rows[name].good
-    runs = [c.validation if validation else c.training for c in candidates]
+    pair = [candidates[_MODEL], candidates[name]]
+    runs = [c.validation if validation else c.training for c in pair]
     shares = [fits(validation or training, run) for run in runs]
-    names = variant.output_names
+    names = estimator.model.output_names
     return Alternative(
         name,
         better,
         {n: (float(a), float(b)) for n, a, b in zip(names, *shares, strict=True)},
-        _moved(uncertainty, fitted.parameters_),
+        _moved(uncertainty, estimators[name].parameters_),
         comparison,
-        terms,
+        next(added for suspect, _, added in suspected if suspect == name),
     )
+
+
+def _fitted(estimator: GASSI, model: ProcessModel, training: Sequence[Dataset]) -> GASSI | None:
+    """A model fitted with the settings of an estimator; None where no simulation succeeds."""
+    from sysid.gassi import GASSI
+
+    settings = {**estimator.get_params(deep=False), "model": model}
+    try:
+        return GASSI(**settings).fit(list(training))
+    except ModelError:
+        return None
 
 
 def moved_by_noise(
@@ -125,20 +133,25 @@ def _raised(noise: FloatArray, place: int, size: float) -> FloatArray:
     return raised
 
 
-def _surest(
+def _suspected(
     findings: Sequence[Finding], model: ProcessModel
-) -> tuple[str, ProcessModel, tuple[AddedTerm, ...]] | None:
-    """Name and model of what is to be fitted, and the terms that were added."""
+) -> list[tuple[str, ProcessModel, tuple[AddedTerm, ...]]]:
+    """Name and model of what is to be fitted, the surest first, and the terms that were added."""
+    variants = variants_of(model)
     for finding in findings:
         if finding.kind == "variant":
-            return finding.name, variants_of(model)[finding.name], ()
+            parts = {name: set(v.parameter_names) for name, v in variants.items()}
+            least, most = set(model.parameter_names), parts[finding.name]
+            within = [name for name, between in parts.items() if least < between < most]
+            return [(name, variants[name], ()) for name in (finding.name, *within)]
     for finding in findings:
         if finding.term is not None and finding.counts:
             try:
-                return description(finding), with_terms(model, [finding.term]), (finding.term,)
+                added = with_terms(model, [finding.term])
             except ModelError:  # it has a parameter of that name
-                return None
-    return None
+                return []
+            return [(description(finding), added, (finding.term,))]
+    return []
 
 
 _MODEL = "the model"
