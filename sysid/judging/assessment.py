@@ -135,12 +135,13 @@ def examine(
     """
     residual, finite = record.outputs - simulated, bool(np.all(np.isfinite(simulated)))
     systematic = None if expected is None else expected.systematic
+    evened = residual if expected is None else expected.evened(residual)
     shared = by_speed = None
-    alone = errors_alone(residual) if finite else None
+    alone = errors_alone(evened) if finite else None
     if alone is not None and record.jitter.size:
         alone[record.jitter.any(axis=0)] = 0.0  # each has a variance of its own
     if systematic is not None and finite:
-        by_speed = errors_by_speed(residual, simulated, systematic)
+        by_speed = errors_by_speed(evened, simulated, systematic)
         if record.jitter.size:
             by_speed[record.jitter.any(axis=0)] = 0.0  # that is why they do
         if not record.input_noise.any():  # which comes through the plant to all outputs

@@ -20,6 +20,7 @@ from sysid.problem.space import SearchSpace
 
 _DRAWS = 40  # realisations of the inputs' noise: they give a variance to within 22 %
 _STEP = 1e-5  # of a search coordinate, for slopes
+_EVEN = 0.1  # of a mean square, what is not passed on at least
 _FINER = 1e-2  # part of the accuracy at which the error of a simulation shows
 
 
@@ -39,11 +40,13 @@ class ExpectedErrors:
     next, by the noise of inputs, which a plant passes on slowly or at times. systematic:
     (n_samples, n_outputs, k), errors that go with the inputs, each by one standard deviation of
     what makes it: directions of the parameters, the sample that a state starts at, the simulation.
+    passed_on: (n_samples, n_outputs), variance by noise of inputs at each sample.
     """
 
     noise: FloatArray
     chance: FloatArray
     systematic: FloatArray
+    passed_on: FloatArray
 
     @property
     def freedom(self) -> FloatArray:
@@ -59,6 +62,20 @@ class ExpectedErrors:
         """Mean square that is to be expected, (n_outputs,); NaN where the noise is not known."""
         variance: FloatArray = self.noise + np.mean(np.sum(self.systematic**2, axis=2), axis=0)
         return variance
+
+    def evened(self, residual: FloatArray) -> FloatArray:
+        """Residuals (n_samples, n_outputs) as large at every sample, were the model right.
+
+        A plant passes noise of its inputs on at times, as where motion turns: what is left of it
+        follows the motion, and is no pattern of what the model lacks.
+        """
+        seen = np.isfinite(residual)
+        squares = np.sum(np.where(seen, residual, 0.0) ** 2, axis=0)
+        mean = squares / np.maximum(seen.sum(axis=0), 1)
+        even = np.maximum(mean - self.passed_on.mean(axis=0), _EVEN * mean) + self.passed_on
+        parts = np.divide(mean, even, out=np.ones_like(even), where=even > 0.0)
+        evened: FloatArray = residual * np.sqrt(parts)
+        return evened
 
 
 @dataclass(frozen=True)
@@ -115,11 +132,11 @@ def expected_errors(
     jitter = _by_jitter(record, lambda given: runs(vector[None], given)[0])
     variance = record.output_noise**2 + jitter
     variance = np.where(variance > 0.0, variance, np.nan)
-    chance = np.zeros(len(variance))
+    chance, passed_on = np.zeros(len(variance)), np.zeros_like(undisturbed)
     if np.any(record.input_noise):
-        squares = _by_input_noise(runs, vector, record, undisturbed)
+        squares, passed_on = _by_input_noise(runs, vector, record, undisturbed)
         variance, chance = variance + squares.mean(axis=0), squares.var(axis=0, ddof=1)
-    return ExpectedErrors(variance, chance, np.concatenate(systematic, axis=2))
+    return ExpectedErrors(variance, chance, np.concatenate(systematic, axis=2), passed_on)
 
 
 def _by_jitter(record: Dataset, run: Run) -> FloatArray:
@@ -163,14 +180,20 @@ def _by_parameters(
 
 def _by_input_noise(
     runs: Runs, vector: FloatArray, record: Dataset, undisturbed: FloatArray
-) -> FloatArray:
-    """Mean square of each output by noise of the inputs, of each draw, (_DRAWS, n_outputs)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Squares of each output by noise of the inputs: the mean of each draw, and of each sample.
+
+    (_DRAWS, n_outputs) and (n_samples, n_outputs).
+    """
     rng, squares = np.random.default_rng(0), np.zeros((_DRAWS, undisturbed.shape[1]))
+    each = np.zeros_like(undisturbed)
     for draw in squares:
         noise = rng.standard_normal(record.inputs.shape) * record.input_noise
         disturbed = runs(vector[None], replace(record, inputs=record.inputs + noise))[0]
-        draw[:] = np.mean((disturbed - undisturbed) ** 2, axis=0)
-    return squares
+        square = (disturbed - undisturbed) ** 2
+        draw[:] = np.mean(square, axis=0)
+        each += square / _DRAWS
+    return squares, each
 
 
 def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
@@ -178,7 +201,8 @@ def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
 
     >>> rng = np.random.default_rng(0)
     >>> noise = rng.standard_normal((1000, 2)) * [1.0, 3.0]
-    >>> expected = ExpectedErrors(np.ones(2), np.zeros(2), np.zeros((1000, 2, 0)))
+    >>> nothing, none = np.zeros((1000, 2, 0)), np.zeros((1000, 2))
+    >>> expected = ExpectedErrors(np.ones(2), np.zeros(2), nothing, none)
     >>> test = floor_test(noise, expected)
     >>> test.ratio.round().tolist(), (test.p_value < 0.01).tolist()
     ([1.0, 3.0], [False, True])

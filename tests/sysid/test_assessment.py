@@ -217,8 +217,9 @@ def test_an_error_several_times_as_large_may_still_be_a_small_one(size):
 
 
 def expected(noise, data, **systematic):
-    nothing = np.zeros((*data.outputs.shape, 0))
-    return ExpectedErrors(np.array(noise), np.zeros(len(noise)), systematic.get("errors", nothing))
+    nothing, none = np.zeros((*data.outputs.shape, 0)), np.zeros(data.outputs.shape)
+    errors, passed_on = systematic.get("errors", nothing), systematic.get("passed_on", none)
+    return ExpectedErrors(np.array(noise), np.zeros(len(noise)), errors, passed_on)
 
 
 def test_errors_of_the_noise_alone_are_no_fault_however_large():
@@ -459,19 +460,25 @@ def test_an_error_that_two_outputs_share_is_no_sensors(push, trust):
 
 
 def test_errors_that_grow_with_the_rate_of_change_are_no_sensors():
-    def jittered(seed, jitter):
+    def jittered(seed, jitter, passed_on=0.0):
         data = record(seed)
         smooth = lfilter([0.1], [1.0, -0.9], data.inputs, axis=0)
-        rng = np.random.default_rng([seed, 5])
+        rng, rates = np.random.default_rng([seed, 5]), np.gradient(smooth, axis=0)
         errors = NOISE * rng.standard_normal((N, 2))
-        errors += jitter * rng.standard_normal((N, 2)) * np.gradient(smooth, axis=0)
+        errors += jitter * rng.standard_normal((N, 2)) * rates
         data = replace(data, outputs=smooth + errors)
-        return examine(data, smooth, nothing_expected(data))
+        unknown, by_inputs = [np.nan, np.nan], (passed_on * rates) ** 2
+        return examine(data, smooth, expected(unknown, data, passed_on=by_inputs))
 
     judged = verdict([jittered(1, 1.0)], [jittered(2, 1.0)])
     assert judged.predicted.trust == "good"
     assert judged.parameters.reasons[0].startswith("speed errs more the faster it changes")
     assert verdict([jittered(1, 0.0)], [jittered(2, 0.0)]).trust == "good"
+    # Noise of inputs that the plant passes on in fast motion is no fault, unless it is far less.
+    passed_on = verdict([jittered(1, 1.0, passed_on=1.0)], [jittered(2, 1.0, passed_on=1.0)])
+    assert passed_on.trust == "good"
+    more = verdict([jittered(1, 1.0, passed_on=0.2)], [jittered(2, 1.0, passed_on=0.2)])
+    assert "speed errs more the faster" in more.parameters.reasons[0]
 
 
 @pytest.mark.parametrize("outliers", [0.05, 0.0])
