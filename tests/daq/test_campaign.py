@@ -110,6 +110,7 @@ def test_every_log_with_every_model_and_seed(folder):
     assert kept["error"]["value"] == best["best"]
 
 
+@pytest.mark.soak
 def test_what_a_campaign_keeps_starts_where_its_fit_did(tmp_path):
     slide_log(3.0).to_csv(tmp_path / "slide.csv", index=False)
     model = slide_model(tmp_path)

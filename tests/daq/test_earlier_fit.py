@@ -61,6 +61,7 @@ def searched(case):
     return identified(case)[0]
 
 
+@pytest.mark.soak
 def test_it_comes_to_what_a_search_comes_to_without_one(case, searched):
     begun, notes = identified(case, *of(case[2]))
     assert ANEW not in notes

@@ -82,6 +82,7 @@ def test_a_table_does_for_a_log(recorded, tmp_path):
     assert from_table.parameters["value"].equals(from_log.parameters["value"])
 
 
+@pytest.mark.soak
 def test_a_replay_is_the_same_from_the_result_and_from_its_file(recorded, found, tmp_path):
     _, _, validation = recorded
     replayed = replay(validation, found)

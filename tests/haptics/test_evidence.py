@@ -243,6 +243,7 @@ def test_a_wall_by_the_static_controller_is_that_of_volts_by_a_constant(tmp_path
     assert n > 1000 and np.abs(depths[0][:n] - depths[1][:n]).max() < 0.02
 
 
+@pytest.mark.soak
 def test_rig_check_tells_which_walls_are_passive(static):
     folder, path, _ = static
     file = walls(folder, path, stiffnesses=[0.2], dampings=[6e-5], brake_commands=[0.0])

@@ -55,6 +55,7 @@ def test_with_the_sensor_between_c0_and_c1_are_the_plants(between):
     assert found["B_m"].value == pytest.approx(B_M, rel=0.06)
 
 
+@pytest.mark.soak
 def test_the_torque_of_every_plateau_is_the_plants(between):
     (table,) = (table for table in between[3].tables if table.name == "torque_velocity")
     own = table.columns

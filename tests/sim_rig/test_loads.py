@@ -281,6 +281,7 @@ def test_the_equilibrium_of_mass_and_hand():
     assert found["theta"][-1] == pytest.approx(brentq(left, 1.0, 12.0), abs=1e-3)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("hysteresis", ["bouc-wen", "dahl", "lugre"])
 def test_a_brake_that_holds_a_wound_load_lets_it_go_softly(hysteresis):
     """No more than the mass's own weight pulls at the shaft, in either direction."""

@@ -94,6 +94,7 @@ def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
     assert noncentrality([told], rival, end) == pytest.approx(exact, rel=1e-6)
 
 
+@pytest.mark.soak
 def test_a_rival_is_fitted_to_noisy_logs_as_well_as_it_can_be():
     """Along Rosenbrock's valley, of which noise leaves a hundredth part to gain."""
     valley = spring(
@@ -233,6 +234,7 @@ def test_mistakes_are_named(models, options, named):
         discriminate(models, [waves()], **{**QUICK, **options})
 
 
+@pytest.mark.soak
 def test_a_rival_that_holds_the_truth_is_fitted_from_the_truth():
     frequency = ("w", 12.0, 1.0, 400.0)
     plain = spring("plain", lambda u, p: np.sin(p[0] * u), frequency)

@@ -70,6 +70,7 @@ def fitted(records, earlier=None, **settings):
     return GASSI(peak(), **FEW, **settings).fit(records, earlier=earlier)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("process", [{}, {"process_noise": {"y": 0.01}}])
 def test_a_search_ends_no_higher_than_the_minimum_beside_an_earlier_fit(records, process):
     alone = fitted(records, **process)

@@ -506,6 +506,7 @@ def test_what_a_model_may_lack_is_not_tested_where_noise_moves_free_runs_too_far
     assert not any("The data ask for" in reason for reason in verdict.reasons)
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("late", [0, 5])
 def test_what_a_model_may_lack_is_tested_by_the_innovations_of_averaged_inputs(late):
     """Where noise hides no bend of what is left: a right model lacks nothing, a delay is named."""
@@ -685,6 +686,7 @@ def test_where_a_filter_jumps_slopes_are_those_of_the_side_without():
     assert np.abs(slopes[:, 1]).max() < 10.0 * size
 
 
+@pytest.mark.soak
 def test_where_a_filter_jumps_on_both_sides_each_residual_has_its_own():
     """Of two states next to a kink one jumps where it is moved up, the other where down."""
     beside = 5e-7
@@ -816,6 +818,7 @@ def still_beside_a_lag():
     )
 
 
+@pytest.mark.soak
 def test_an_output_that_never_moves_is_no_matter_for_a_filter():
     rng = np.random.default_rng(0)
     u = np.repeat(rng.uniform(-1.0, 1.0, 40), 10)
