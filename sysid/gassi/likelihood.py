@@ -55,6 +55,7 @@ _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _EXPLORED = 2  # minima whose lookalikes are descended from
 _EXPLORED_BY_FILTER = 5  # the same by a filter
 _BETTER = 1.0  # deviance by which one of them has to be better than the one before
+_COMPARED = 0.05  # deviance to which minima are compared: what decides is hundreds of times that
 
 Watch = Callable[[Point], None]
 # Whether a chromosome (n_free,) is far from minima, and others.
@@ -327,7 +328,9 @@ def _compared(objective: Objective, ends: Sequence[Refinement], optima: Optima) 
     if not ends:
         return []
     finer = _fine_enough(objective, ends)
-    begun = [begin(finer, end.chromosome) for end in ends]
+    # A share of the error is that of deviance by so many residuals.
+    tolerance = max(TOLERANCE, _COMPARED / (2.0 * float(finer.counts.sum())))
+    begun = [begin(finer, end.chromosome, tolerance=tolerance) for end in ends]
     reached = refine_each(finer, begun, enough=partial(_known, finer, optima.new, ()))
     chromosomes = [_inside(finer, end.chromosome) for end in reached if optima.new(end.chromosome)]
     if not chromosomes:
