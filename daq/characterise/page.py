@@ -42,6 +42,7 @@ def write_page(root: Path, rounds: Sequence[Round], reason: str) -> Path:
                 for each, history in zip(rounds, histories, strict=True)
             ],
             "unknown": rounds[-1].design["unknown"],
+            "otherwise": rounds[-1].design.get("otherwise"),
             "software": software_versions(),
         }
     )

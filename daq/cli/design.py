@@ -94,6 +94,8 @@ def _show(result: DesignResult) -> None:
         terminal.print_text(
             f"Stays unknown: {names}: {unknown.why}. What would tell: {unknown.cure}."
         )
+    if result.otherwise:
+        terminal.print_text(result.otherwise)
     _show_next(result)
 
 

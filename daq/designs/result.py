@@ -109,6 +109,16 @@ class DesignResult(RunsResult):
         return [*self._of_structure(), *self._of_information()]
 
     @property
+    def otherwise(self) -> str | None:
+        """What else may tell all that acts only together, in a sentence."""
+        if not self.design.tied:
+            return None
+        return (
+            "Another mounting may tell what acts only together, without a load or with its sensor "
+            f"elsewhere: rig models {self.model_name} --identifiable compares."
+        )
+
+    @property
     def document(self) -> dict[str, Any]:
         """The same for machines."""
         return {
@@ -118,19 +128,18 @@ class DesignResult(RunsResult):
                 {**asdict(quantity), "met": quantity.met} for quantity in self.design.quantities
             ],
             "unknown": [asdict(unknown) for unknown in self.unknown],
+            "otherwise": self.otherwise,
             **self.of_runs(self.design),
         }
 
     def _of_structure(self) -> list[Unknown]:
         """What the equations let no experiment tell."""
-        listing = f"rig models {self.model_name} --identifiable"
         unknown = []
         for group in self.design.tied:
             together = ", ".join(combination.text for combination in group.combinations)
             only = f"only {together} of them act" if together else "they act only together"
             fix = " and ".join(group.fix)
-            cure = f"measure {fix} by other means and fix it, or mount the rig otherwise: with"
-            cure += f" another load or its sensor elsewhere ({listing} compares)"
+            cure = f"measure {fix} by other means and fix it"
             unknown.append(Unknown(group.parameters, f"on what is measured {only}", cure))
         if self.design.unseen:
             cure = "fix it by other means, or measure what it acts on"

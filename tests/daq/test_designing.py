@@ -222,6 +222,8 @@ def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path)
     assert by_name.keys() == {"R_m", "K_m", "B_m"}
     assert by_name["K_m"]["target"] == 0.01
     assert all(q["after"] < q["before"] for q in document["quantities"])
+    # All else is fixed: nothing is tied, and B_m alone is hardly felt.
+    assert [u["names"] for u in document["unknown"]] == [["B_m"]] and not document["otherwise"]
     for run in document["runs"]:
         checked = rig("check", run["file"], "--json", cwd=tmp_path)
         assert json.loads(checked.stdout)["samples"] == 1000
