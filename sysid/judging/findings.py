@@ -87,11 +87,11 @@ class Finding:
 
 
 _WORDS = {
-    "delay": "{name} is logged {amplitude:.3g} s {late}",
-    "mean": "{name} is logged as its mean over the {amplitude:.3g} s before each sample, as "
+    "delay": "{name} is logged {time} {late}",
+    "mean": "{name} is logged as its mean over the {time} before each sample, as "
     "differences of positions are, or late by half of that",
-    "filter": "{name} is logged through a filter of {amplitude:.3g} s",
-    "lag": "{name} acts with a lag of {amplitude:.3g} s",
+    "filter": "{name} is logged through a filter of {time}",
+    "lag": "{name} acts with a lag of {time}",
     "play": "{name} acts through play (hysteresis) of {amplitude:.3g} {unit}",
     "offset": "{name} is {amplitude:.3g} {unit} off{instead}",
     "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on{instead}",
@@ -138,6 +138,7 @@ def description(finding: Finding) -> str:
             name=finding.name,
             late=late,
             amplitude=size,
+            time=_time(size),
             times=1.0 + size,
             unit=unit,
             instead=instead,
@@ -145,6 +146,18 @@ def description(finding: Finding) -> str:
         .replace("  ", " ")
         .strip()
     )
+
+
+def _time(seconds: float) -> str:
+    """A time in the multiple of its unit that reads best.
+
+    >>> _time(5.01e-5), _time(0.002), _time(0.25)
+    ('50.1 µs', '2 ms', '0.25 s')
+    """
+    size = abs(seconds)
+    if size >= 0.1 or not size:
+        return f"{seconds:.3g} s"
+    return f"{1e3 * seconds:.3g} ms" if size >= 1e-3 else f"{1e6 * seconds:.3g} µs"
 
 
 def _term_text(term: AddedTerm) -> str:

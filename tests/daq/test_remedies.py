@@ -206,7 +206,7 @@ def test_a_speed_that_is_a_difference_of_positions_is_named_and_right_by_the_com
     fixed = {"damping": truth["damping"]}
     quick = {"model": MOTOR, "population": 100, "generations": 20, "fixed": fixed}
     first = identify(log, validate=check, **quick)
-    assert "omega is logged as its mean over the 0.002 s" in " ".join(first.verdict.reasons)
+    assert "omega is logged as its mean over the 2 ms" in " ".join(first.verdict.reasons)
     assert first.trust != "good"
     found = first.suspicion.findings
     setting = remedies(IdentificationConfig(), {"omega": "rad/s"}, findings=found)

@@ -314,13 +314,13 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     far = found([finding("delay", 2.5)])
     assert (far.predicted.trust, far.parameters.trust) == ("good", "limited")
     assert far.parameters.reasons == (
-        "speed is logged 0.002 s late (p = 1e-06); with that K_m 1 -> 1.25.",
+        "speed is logged 2 ms late (p = 1e-06); with that K_m 1 -> 1.25.",
     )
     both = found([finding("delay", 1.0), finding("offset", 0.8)])
     assert len(both.parameters.reasons) == 2, "together they move it by 1.8 deviations"
     assert found([finding("delay", 1.0), finding("offset", -0.8)]).trust == "good"
     near = found([finding("delay", 0.5)])
-    assert near.trust == "good" and "speed is logged 0.002 s late" in near.notes[0]
+    assert near.trust == "good" and "speed is logged 2 ms late" in near.notes[0]
     turned = found([replace(finding("gain", 2.5), amplitude=-2.4)])
     assert turned.parameters.reasons == (
         "speed has the opposite sign of what the model has (p = 1e-06).",

@@ -45,8 +45,8 @@ CASES = {case.name: case for case in cases()}
         [
             ("sign of the current", "current has the opposite sign"),
             ("load half", "load is 1.9"),
-            ("speed through a filter", "omega is logged through a filter of 0.008"),
-            ("load ten samples late", "load is logged 0.02"),
+            ("speed through a filter", "omega is logged through a filter of 8"),
+            ("load ten samples late", "load is logged 20"),
             ("speed clipped at 80 %", "omega saturates near its largest values"),
             ("Coulomb friction, load's noise", "a term in the sign of omega"),
             ("load's noise, not told", "load is logged with noise of 0.018"),
@@ -247,7 +247,7 @@ def of_range(name, low, high):
 
 def test_where_an_end_of_a_range_holds_a_parameter_a_late_input_is_named_all_the_same():
     late = replace(CASES["load ten samples late"], model=of_range("K", 0.05, 0.098))
-    assert tried(late, 0).verdict.parameters.reasons[0].startswith("load is logged 0.02")
+    assert tried(late, 0).verdict.parameters.reasons[0].startswith("load is logged 20")
 
 
 def test_what_an_end_of_a_range_leaves_is_nothing_missing():
