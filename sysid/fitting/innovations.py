@@ -58,7 +58,7 @@ _WHITE = 1.05  # ratio of what third and fifth differences show, below which it 
 _TINY = 1e-140  # a deviation whose square is not yet zero
 _LEFT = 0.5  # part of an input's noise that averages may leave: with more they cure nothing
 _SHOWING = 0.025  # part of an output's peak that inputs' averages may take from it
-MISJUDGED = 0.02  # share of an output's innovations, above which a filter is no judge
+MISJUDGED = 0.02  # share of an output's innovations, above which a filter may be no judge
 # Draws of the inputs' noise that show where equations bend under it, and parts of an innovation's
 # deviation from which they do.
 _DRAWS, _BENT = 8, 0.1
@@ -403,8 +403,13 @@ class Innovations(Objective):
 
         It takes equations for straight over what noise does.
         """
+        return self.share_bent(self.bends(chromosome))
+
+    def share_bent(self, bends: FloatArray) -> FloatArray:
+        """The same by ``bends``."""
+        parts = bends / (self._noise_of_each() * np.concatenate(self.trust))
         seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
-        bent = seen & ~(np.median(np.abs(self._bends(chromosome)), axis=0) <= _BENT)
+        bent = seen & ~(np.median(np.abs(parts), axis=0) <= _BENT)
         share: FloatArray = bent.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
         return share
 
@@ -428,11 +433,12 @@ class Innovations(Objective):
     def bends(self, chromosome: FloatArray) -> FloatArray:
         """What draws of noise do to residuals but in proportion, at (n_free,).
 
-        (n_draws, n_residuals, n_outputs), in the units of residuals.
+        (n_draws, n_residuals, n_outputs), in the units of residuals; not finite where noise makes
+        a simulation fail.
         """
-        bends = self._bends(chromosome) * self._noise_of_each() * np.concatenate(self.trust)
-        finite: FloatArray = np.where(np.isfinite(bends), bends, 0.0)
-        return finite
+        parts = self._noise_of_each() * np.concatenate(self.trust)
+        bends: FloatArray = self._bends(chromosome) * parts
+        return bends
 
     def _bends(self, chromosome: FloatArray) -> FloatArray:
         """What noise does to innovations but in proportion, (n_draws, n_residuals, n_outputs).

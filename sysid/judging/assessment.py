@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.fitting.innovations import MISJUDGED
 from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.findings import MOVED, Finding, description
@@ -501,8 +500,8 @@ def _corrected(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
 
 
 def _bent_filter(model: ProcessModel, uncertainty: Uncertainty) -> Iterator[str]:
-    """Reason: a filter that takes for straight what is bent within noise."""
-    if np.any(uncertainty.bent > MISJUDGED):
+    """Reason: a filter that takes for straight what is bent within noise, where that matters."""
+    if uncertainty.moved_by_bends > MOVED:  # intervals count what is less
         j = int(np.argmax(uncertainty.bent))
         yield (
             f"The noise of the inputs hides where the equations bend (in {uncertainty.bent[j]:.0%} "

@@ -15,7 +15,7 @@ from typing import Literal, Self
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.fitting.innovations import filters
+from sysid.fitting.innovations import MISJUDGED, filters
 from sysid.fitting.objective import Objective
 from sysid.problem.expressions import measuring_effort
 from sysid.problem.given import covariance_factor
@@ -25,7 +25,7 @@ from sysid.uncertainty.ends import RangeEnds
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.profile import Fit, Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
-from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
+from sysid.uncertainty.sensitivity import Sensitivity, bend_errors, sensitivity
 from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
 
 # Standard deviation of a logarithm above which the slopes at the estimate are no guide.
@@ -83,6 +83,8 @@ class Uncertainty:
     (n_outputs,), correlation of each innovation with the one before where a filter's were
     minimised, which are white at the right parameters of the right model; empty elsewhere. bent:
     likewise, share of the innovations for which its equations are no straight lines within noise.
+    moved_by_bends: by how many of the deviations that they had else that moves any of the
+    quantities, at most, to first order; 0 where hardly any innovation is bent.
     """
 
     parameters: tuple[Estimate, ...]
@@ -97,6 +99,7 @@ class Uncertainty:
     factor: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     succession: FloatArray = field(default_factory=lambda: np.zeros(0))
     bent: FloatArray = field(default_factory=lambda: np.zeros(0))
+    moved_by_bends: float = 0.0
     by_slopes: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __repr__(self) -> str:
@@ -225,8 +228,10 @@ def uncertainty(
         bent=_bent(local),
         by_slopes=analysis.covariance.matrix,
     )
-    joint, simultaneous = analysis.together([e.name for e in result.determined()])
-    return replace(result, joint=joint, simultaneous=simultaneous)
+    intervals = [e.name for e in result.determined()]
+    joint, simultaneous = analysis.together(intervals)
+    moved = analysis.moved_by_bends(intervals) if np.any(result.bent > MISJUDGED) else 0.0
+    return replace(result, joint=joint, simultaneous=simultaneous, moved_by_bends=moved)
 
 
 def _with_bottoms(estimate: Estimate, bottoms: Sequence["_Analysis"]) -> Estimate:
@@ -270,7 +275,7 @@ def _succession(local: Sensitivity) -> FloatArray:
 def _bent(local: Sensitivity) -> FloatArray:
     criterion = local.criterion
     if filters(criterion):
-        return criterion.bent(local.chromosome)
+        return criterion.share_bent(local.bends)
     return np.zeros(0)
 
 
@@ -525,6 +530,24 @@ class _Analysis:
         largest = np.abs(np.concatenate([common, alone], axis=1)).max(axis=1, initial=0.0)
         joint, widest = float(np.mean(largest <= Z95)), float(np.quantile(largest, 0.95))
         return joint, max(widest / Z95, 1.0)
+
+    def moved_by_bends(self, names: Sequence[str]) -> float:
+        """Deviations that any of the quantities is moved by, at most, where noise bends equations.
+
+        To first order; infinite where a simulation fails under that noise.
+        """
+        local = self.local
+        if not np.isfinite(local.bends[:, local.seen]).all():
+            return float("inf")
+        weight = self.objective.least_squares_weights(local.residual)
+        pushes = [np.einsum("tip,ti,i->p", local.slopes, c, weight) for c in bend_errors(local)]
+        moves = self.covariance.curvature @ np.sum(pushes, axis=0)
+        most = 0.0
+        for gradient in (self.gradients[name] for name in names):
+            move, deviation = abs(float(gradient @ moves)), self.covariance.deviation(gradient)
+            without = np.sqrt(max(deviation**2 - move**2, _LEAST * deviation**2))  # it counts
+            most = max(most, move / without if without > 0.0 else 0.0)
+        return most
 
     def _pushed_by(self, deviations: float) -> BoolArray:
         """Parameters, (n_free,), that data push so many deviations beyond an end of a range."""

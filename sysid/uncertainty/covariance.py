@@ -17,6 +17,7 @@ from sysid.uncertainty.colour import colour, score_covariance
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
     averages_errors,
+    bend_errors,
     input_noises,
     noise_pushes,
     parabola_errors,
@@ -104,7 +105,7 @@ def covariance(
     score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
     starts = (change for _, change in start_errors(sensitivity))
     constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
-    for errors in (*constant, averages_errors(sensitivity)):
+    for errors in (*constant, averages_errors(sensitivity), bend_errors(sensitivity)):
         score += _score_covariance_by(weighted, errors)
     pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, slopes.shape[2])
     score += pushes.T @ pushes

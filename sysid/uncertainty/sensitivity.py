@@ -74,6 +74,13 @@ class Sensitivity:
         return float(self.criterion.evaluate(self.chromosome[None])[0][0])
 
     @cached_property
+    def bends(self) -> FloatArray:
+        """As of ``Innovations.bends``; of no draws without a filter."""
+        if filters(self.criterion):
+            return self.criterion.bends(self.chromosome)
+        return np.zeros((0, *self.residual.shape))
+
+    @cached_property
     def increments(self) -> FloatArray:
         """Change of each parameter per unit of its coordinate, (n_free,)."""
         return np.where(self.objective.space.log, self.chromosome, 1.0)
@@ -247,6 +254,16 @@ def parabola_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
         moved = _change_by_record(sensitivity, k, replace(record, outputs=outputs))
         change += moved * sensitivity.share
     yield change
+
+
+def bend_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+    """Change (n_residuals, n_outputs) of a filter's innovations by equations that noise bends.
+
+    Its mean over draws of that noise, which acts in one way on all samples alike.
+    """
+    if len(sensitivity.bends):
+        mean = sensitivity.bends.mean(axis=0)
+        yield np.where(np.isfinite(mean), mean, 0.0)
 
 
 def averages_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:

@@ -513,7 +513,7 @@ def test_a_filter_whose_errors_it_could_foresee_makes_parameters_doubtful():
 
 
 def test_a_filter_within_whose_noise_equations_bend_makes_parameters_doubtful():
-    bent = replace(told(""), bent=np.array([0.01, 0.07]))
+    bent = replace(told(""), bent=np.array([0.01, 0.07]), moved_by_bends=9.0)
     (reason,) = verdict(uncertainty=bent).parameters.reasons
     assert "bend (in 7% of the samples of current)" in reason
-    assert verdict(uncertainty=replace(bent, bent=np.array([0.01, 0.01]))).trust == "good"
+    assert verdict(uncertainty=replace(bent, moved_by_bends=1.4)).trust == "good"

@@ -599,6 +599,36 @@ def test_a_filter_tells_where_noise_hides_the_bend_of_the_equations():
     assert share(lag(), 0.1) == 0.0
 
 
+def told_of_bends(seed, size):
+    """What a fit tells of |u| as it passes zero fast, with noise of 0.3."""
+    rng = np.random.default_rng(seed)
+    u = size * lfilter([0.23], [1.0, -0.9], rng.standard_normal(1500))
+    a, b = np.array([[-1.0 / TAU]]), np.array([[GAIN / TAU]])
+    y = linear_response(a, b, np.abs(u)[:, None], DT, "zoh")
+    y = y + 0.05 * rng.standard_normal(y.shape)
+    noisy = u + OF_INPUT * rng.standard_normal(1500)
+    record = Dataset(noisy, y, DT, input_noise=np.array([OF_INPUT]))
+    objective = Objective(BatchSimulator(BENT), SearchSpace.of(BENT), [record])
+    fit = NoiseFit(objective, objective, corrects=True)(np.array([GAIN, TAU]))
+    return uncertainty(fit.objective, fit.chromosome)
+
+
+def test_intervals_count_how_far_bends_within_noise_lead_a_filter_astray():
+    """Time constants come out two to five deviations too short where nothing counts it."""
+    off = []
+    for seed in range(6):
+        told = told_of_bends(seed, size=3.0)
+        gain, tau, *_ = told.parameters
+        off.append([(gain.value - GAIN) / gain.std, (tau.value - TAU) / tau.std])
+        assert told.bent[0] > 0.05 and told.moved_by_bends > 1.5
+    assert np.sqrt(np.mean(np.square(off), axis=0)).max() < 1.8
+
+
+def test_bends_within_noise_that_move_nothing_are_told_from_those_that_do():
+    told = told_of_bends(0, size=10.0)
+    assert told.bent[0] > 0.02 and told.moved_by_bends < 1.0
+
+
 @dataclass(frozen=True)
 class EndsAt(NoiseFit):
     """A fit that ends where it is told, or cannot be made."""
