@@ -95,6 +95,7 @@ class Excerpt:
     def _dataset(self, place: int, begin: int, end: int) -> Dataset:
         record = self.records[place]
         part = record.part(begin, end, f"{record.name}, rows {begin + 1} .. {end}")
+        part = replace(part, log=place if self.cut else None)
         if begin == 0:
             return part
         outputs = part.outputs.copy()

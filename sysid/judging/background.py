@@ -27,6 +27,7 @@ from sysid.uncertainty.sensitivity import (
     Sensitivity,
     input_noises,
     sensitivity,
+    sharing_zeros,
     spans,
     zero_errors,
 )
@@ -242,19 +243,25 @@ def _coarseness(objective: Innovations, local: Sensitivity) -> FloatArray:
 
 def _zeros(runs: Sequence[FilteredRun], local: Sensitivity) -> FloatArray:
     """As of ``zero_errors``, with gains as they are, (n_rows, n_outputs, k)."""
-    columns = []
-    for run, rows in zip(runs, record_rows(local.lengths), strict=True):
-        record = run.record
-        changes = [run.logged(_throughout(record.outputs, e)) for e in _each(record.output_zero)]
-        changes += [run.driven(_throughout(record.inputs, e)) for e in _each(record.input_zero)]
-        for change in changes:
+    columns, rows = [], record_rows(local.lengths)
+    for places in sharing_zeros([run.record for run in runs]):
+        changes = [_by_zeros(runs[k]) for k in places]
+        for parts in zip(*changes, strict=True):
             column = np.zeros(local.residual.shape)
-            column[rows] = change / run.scale
+            for k, part in zip(places, parts, strict=True):
+                column[rows[k]] = part / runs[k].scale
             columns.append(column)
     for vector in local.objective.given:
         start = np.zeros(len(runs[0].model.states))
         columns.append(np.concatenate([run.moved(vector, start) / run.scale for run in runs]))
     return np.stack([np.zeros(local.residual.shape), *columns], axis=2)[..., 1:]
+
+
+def _by_zeros(run: FilteredRun) -> list[FloatArray]:
+    """Changes of a run by a deviation of each channel's zero, outputs first."""
+    outputs, inputs = run.record.outputs, run.record.inputs
+    changes = [run.logged(_throughout(outputs, e)) for e in _each(run.record.output_zero)]
+    return changes + [run.driven(_throughout(inputs, e)) for e in _each(run.record.input_zero)]
 
 
 def _each(deviations: FloatArray) -> list[FloatArray]:

@@ -29,7 +29,9 @@ class Dataset:
     n_inputs), by how much the mean of an interpolated input up to the next sample differs from that
     of a straight line, for which filters bend it. Default none. begin: instant of the first row as
     whoever made the record counts time [s]. cut: whether it was cut from a longer record amid its
-    motion, so that states whose first sample is a mean over the time before start elsewhere.
+    motion, so that states whose first sample is a mean over the time before start elsewhere. log:
+    of a part of a longer record the number of that, whose channels' zeros all of its parts share;
+    None of a whole one.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -52,6 +54,7 @@ class Dataset:
     between: FloatArray = field(default_factory=lambda: np.zeros(0))
     begin: float = 0.0
     cut: bool = False
+    log: int | None = None
 
     def __repr__(self) -> str:
         size = f"{self.n_samples} samples, dt={self.dt:g} s"

@@ -1,6 +1,6 @@
 """Slopes of the simulated outputs over the parameters, and what errors of the sensors change."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,8 +14,9 @@ from sysid.fitting.objective import Objective
 from sysid.problem.data import Dataset
 from sysid.uncertainty.colour import record_rows
 
-# Central differences in search coordinates: truncation and rounding both near 1e-8.
-_PERTURBATION = 1e-5
+# Central differences in search coordinates. Along nearly tied parameters slopes all but cancel, and
+# what within the distance is not straight, as friction is not, would stand there for information.
+_PERTURBATION = 1e-7
 _FILTER_PERTURBATION = 1e-6  # the same where kinks make a filter jump: fewer lie within less
 # Part of the larger slopes by which those of both sides differ where there is a kink between them,
 # and how many times as far one looks then which of them a jump has made.
@@ -176,21 +177,41 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
 
     And of parameters that were given, which are as constant.
     """
-    objective = sensitivity.objective
-    for k, rows in enumerate(record_rows(sensitivity.lengths)):
-        record = objective.records[k]
-        for j in np.flatnonzero(record.output_zero):
-            if isinstance(objective, Innovations):
-                outputs = record.outputs.copy()
-                outputs[:, j] += record.output_zero[j]
-                yield _change_by_record(sensitivity, k, replace(record, outputs=outputs))
-                continue
-            change = np.zeros_like(sensitivity.residual)
-            change[rows, j] = record.output_zero[j] / objective.scales[k][j]
-            yield change * sensitivity.share
-        errors = [error for error in np.diag(record.input_zero) if error.any()]
-        yield from _input_changes(sensitivity, k, errors)
+    records = sensitivity.objective.records
+    for places in sharing_zeros(records):
+        first = records[places[0]]
+        for j in np.flatnonzero(first.output_zero).tolist():
+            yield sum((_by_output_zero(sensitivity, k, j) for k in places), np.zeros(()))
+        errors = [error for error in np.diag(first.input_zero) if error.any()]
+        parts = [_input_changes(sensitivity, k, errors) for k in places]
+        yield from (sum(changes, np.zeros(())) for changes in zip(*parts, strict=True))
     yield from given_errors(sensitivity)
+
+
+def sharing_zeros(records: Sequence[Dataset]) -> list[list[int]]:
+    """Places of records whose channels' zeros were calibrated once: the parts of a longer one.
+
+    >>> whole = Dataset(np.zeros(4), np.zeros(4), 0.1)
+    >>> sharing_zeros([whole, replace(whole, log=0), whole, replace(whole, log=0)])
+    [[0], [1, 3], [2]]
+    """
+    logs: dict[tuple[int, int | None], list[int]] = {}
+    for k, record in enumerate(records):
+        logs.setdefault((k, None) if record.log is None else (-1, record.log), []).append(k)
+    return [*logs.values()]
+
+
+def _by_output_zero(sensitivity: Sensitivity, k: int, j: int) -> FloatArray:
+    """Change of all residuals by a deviation of the zero of output j of record k."""
+    objective, record = sensitivity.objective, sensitivity.objective.records[k]
+    if isinstance(objective, Innovations):
+        outputs = record.outputs.copy()
+        outputs[:, j] += record.output_zero[j]
+        return _change_by_record(sensitivity, k, replace(record, outputs=outputs))
+    change = np.zeros_like(sensitivity.residual)
+    rows = record_rows(sensitivity.lengths)[k]
+    change[rows, j] = record.output_zero[j] / objective.scales[k][j]
+    return change * sensitivity.share
 
 
 def given_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:

@@ -246,3 +246,6 @@ def test_a_part_whose_speed_is_a_mean_before_it_starts_as_the_fit_wants():
     plain = SearchSpace.of(model)
     assert plain.with_starts(excerpt.datasets()).names == ("gain", "tau", "y(0) 2")
     assert plain.with_starts(replace(excerpt, cut=False).datasets()).names == ("gain", "tau")
+    # Each tells of which record it is, whose sensors' zeros they share.
+    twice = replace(Excerpt.of([record, record], 4096), cut=True)
+    assert [part.log for part in twice.datasets()] == twice.places == [0, 0, 1, 1]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -321,6 +321,20 @@ def test_a_zero_error_of_an_output_has_the_closed_form_and_covers():
     share, naive = coverage(record)
     assert 0.92 < share < 0.99
     assert naive < 0.85
+
+
+@pytest.mark.parametrize("side", ["input_zero", "output_zero"])
+def test_parts_of_a_record_share_its_zeros(side):
+    """A sensor's zero that was calibrated once is off by the same amount in all parts."""
+    plain, n = LINEAR.records[0], LINEAR.records[0].n_samples
+    zero = np.array([0.2, 0.0, 0.0] if side == "input_zero" else [0.2])
+    whole = replace(plain, **{side: zero})
+    parts = [whole.part(0, n // 2, "first"), whole.part(n // 2, n, "second")]
+    cut = [replace(part, log=0) for part in parts]
+    shared, apart = ([e.std for e in told_of(records)] for records in (cut, parts))
+    np.testing.assert_allclose(shared, [e.std for e in told_of([whole])], rtol=1e-5)
+    # Of two calibrations a part averages out.
+    assert np.max(np.divide(apart, shared)) < 0.8
 
 
 @pytest.mark.soak
