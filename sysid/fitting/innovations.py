@@ -64,7 +64,8 @@ MISJUDGED = 0.02  # share of an output's innovations, above which a filter may b
 _DRAWS, _BENT = 8, 0.1
 # Integration steps of a free run that one of a filter may stand for, and by how many deviations of
 # any quantity the difference may move it where an answer is at stake.
-_COARSER, _MOVING = (3.0, 2.0, 1.0, 0.5, 0.25), 0.2
+_FEWER, _FINER, _MOVING = (3.0, 2.0, 1.0), (0.5, 0.25), 0.2
+_LEAST_STEPS = 1, 8, 16  # a sample, tried in turn where covariances burst
 # Deviations by which parabolas for averaged outputs may move any quantity: intervals count it.
 _OFF = 1.5
 _FEWEST = 2  # a sample, where a free run takes more
@@ -197,13 +198,25 @@ class Innovations(Objective):
 
     def _with_fewest_steps(self, chromosome: FloatArray, moving: float) -> Self:
         exact = self.uneased._in_noise(chromosome)
-        for coarseness in _COARSER:
+        for coarseness in _FEWER:
             coarser = self._with(coarseness=coarseness, least=1)
-            error = np.linalg.norm(coarser._in_noise(chromosome) - exact)
-            burst = not error < _BURST * np.linalg.norm(exact)
-            if error < moving or (coarseness <= 1.0 and not burst):
+            if np.linalg.norm(coarser._in_noise(chromosome) - exact) < moving:
+                return coarser
+        for least in _LEAST_STEPS:  # of a record that takes fewer
+            coarser = self._with(coarseness=1.0, least=least)
+            if not self._bursts(coarser._in_noise(chromosome) - exact, exact):
                 return coarser
         return self.uneased
+
+    def _bursts(self, change: FloatArray, exact: FloatArray) -> bool:
+        """Whether steps change what any output's innovations of any record are.
+
+        change, exact: (n_residuals, n_outputs), in parts of the noise. Records that are right do
+        not hide one whose covariance bursts.
+        """
+        begins = np.cumsum([0, *(record.n_samples for record in self.records[:-1])])
+        changes, sizes = (np.add.reduceat(part**2, begins, axis=0) for part in (change, exact))
+        return not bool(np.all(changes <= _BURST**2 * sizes))
 
     def exactly(self, chromosome: FloatArray) -> Self:
         """With as many integration steps as an answer wants at a chromosome, (n_free,).
@@ -211,7 +224,7 @@ class Innovations(Objective):
         Those that a search goes by may move quantities by more than a part of their deviations.
         """
         exact, finer = self.uneased._in_noise(chromosome), self
-        for coarseness in [c for c in _COARSER if c < self.coarseness]:
+        for coarseness in [c for c in (*_FEWER, *_FINER) if c < self.coarseness]:
             if finer._moved_by(finer._in_noise(chromosome) - exact, chromosome) < _PART:
                 break
             finer = self._with(coarseness=coarseness)

@@ -364,35 +364,60 @@ def test_a_filter_takes_fewer_steps_where_noise_covers_what_they_miss(noise, coa
     assert np.linalg.norm((coarse - fine) * objective.scales[0] / noise) < 0.2
 
 
+COIL = ProcessModel(
+    "coil at an amplifier that ends",
+    (State("voltage", "V", first_sample=False), State("current", "A")),
+    (Input("asked", "A"),),
+    (Output("current", "A"),),
+    tuple(
+        Parameter(name, "1", value, 0.1 * value, 10.0 * value, "log")
+        for name, value in (("K", 100.0), ("w", 660.0), ("R", 1.2), ("L", 8.6e-4))
+    ),
+    lambda x, u, p: (
+        p[1] * (p[0] * (u[0] - x[1]) - x[0]),
+        (min(max(x[0], -24.0), 24.0) - p[2] * x[1]) / p[3],
+    ),
+)
+
+
+def coil_filter(*commands):
+    """By as few steps as do, of records of a coil (n_samples,), whose loop only noise moves fast.
+
+    A free run of a slow command does not need its steps; with few the covariance bursts.
+    """
+    rng, dt, noise = np.random.default_rng(2), 1.25e-3, 0.005
+    records = []
+    for asked in commands:
+        record = Dataset(asked, np.zeros((len(asked), 1)), dt, input_noise=np.array([noise]))
+        exact = BatchSimulator(COIL, accuracy=1e-6).trajectories(COIL.nominal[None], record)[0]
+        outputs = exact + noise * rng.standard_normal(exact.shape)
+        records.append(replace(record, outputs=outputs))
+    objective = Objective(BatchSimulator(COIL), SearchSpace.of(COIL), records)
+    return Innovations.of(objective, np.array([noise]), corrects=True).eased(COIL.nominal)
+
+
+def slowly(n):
+    return np.sin(30.0 * 1.25e-3 * np.arange(n))
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("smooth", [True, False])
 def test_a_filter_takes_the_steps_of_modes_that_only_noise_moves(smooth):
-    """A free run of a slow command does not need them; with few the covariance bursts."""
-    rng, n, dt, noise = np.random.default_rng(2), 400, 1.25e-3, 0.005
-    model = ProcessModel(
-        "coil at an amplifier that ends",
-        (State("voltage", "V", first_sample=False), State("current", "A")),
-        (Input("asked", "A"),),
-        (Output("current", "A"),),
-        tuple(
-            Parameter(name, "1", value, 0.1 * value, 10.0 * value, "log")
-            for name, value in (("K", 100.0), ("w", 660.0), ("R", 1.2), ("L", 8.6e-4))
-        ),
-        lambda x, u, p: (
-            p[1] * (p[0] * (u[0] - x[1]) - x[0]),
-            (min(max(x[0], -24.0), 24.0) - p[2] * x[1]) / p[3],
-        ),
-    )
-    asked = np.sin(30.0 * dt * np.arange(n)) if smooth else prbs(rng, n, -1.0, 1.0)
-    record = Dataset(asked, np.zeros((n, 1)), dt, input_noise=np.array([noise]))
-    exact = BatchSimulator(model, accuracy=1e-6).trajectories(model.nominal[None], record)[0]
-    record = replace(record, outputs=exact + noise * rng.standard_normal(exact.shape))
-    objective = Objective(BatchSimulator(model), SearchSpace.of(model), [record])
-    fitted = Innovations.of(objective, np.array([noise]), corrects=True).eased(model.nominal)
-    faster = model.nominal * np.array([1.0, 1.0, 0.23, 0.23])
-    for by, chromosome in ((fitted, model.nominal), (fitted.uneased, faster)):
+    asked = slowly(400) if smooth else prbs(np.random.default_rng(2), 400, -1.0, 1.0)
+    fitted = coil_filter(asked)
+    faster = COIL.nominal * np.array([1.0, 1.0, 0.23, 0.23])
+    for by, chromosome in ((fitted, COIL.nominal), (fitted.uneased, faster)):
         values = by.residuals(chromosome[None], [128]).values
         assert by.rms(chromosome[None])[0] == pytest.approx(np.sqrt(np.mean(values**2)), rel=0.1)
+
+
+def test_records_that_need_few_steps_do_not_hide_one_whose_covariance_bursts():
+    fitted = coil_filter(slowly(40), prbs(np.random.default_rng(2), 8000, -1.0, 1.0))
+    few, many = (
+        np.sqrt(np.mean(fitted.residuals(COIL.nominal[None], steps).values[:40] ** 2))
+        for steps in (fitted.steps_needed(COIL.nominal[None])[0], [128, 128])
+    )
+    assert few == pytest.approx(many, rel=0.1)
 
 
 def test_where_noise_explains_all_of_a_free_run_a_filter_takes_over():
