@@ -60,8 +60,8 @@ def best_alternative(
     """
     if estimator.model is None:
         return None
-    suspected = _suspected(findings, estimator.model)
-    fitted = {name: _fitted(estimator, model, training) for name, model, _ in suspected}
+    suspected, terms = _suspected(findings, estimator.model)
+    fitted = {name: _fitted(estimator, model, training) for name, model in suspected.items()}
     estimators = {name: e for name, e in fitted.items() if e is not None}
     if not estimators:
         return None
@@ -81,7 +81,7 @@ def best_alternative(
         {n: (float(a), float(b)) for n, a, b in zip(names, *shares, strict=True)},
         _moved(uncertainty, estimators[name].parameters_),
         comparison,
-        next(added for suspect, _, added in suspected if suspect == name),
+        terms,
     )
 
 
@@ -135,23 +135,23 @@ def _raised(noise: FloatArray, place: int, size: float) -> FloatArray:
 
 def _suspected(
     findings: Sequence[Finding], model: ProcessModel
-) -> list[tuple[str, ProcessModel, tuple[AddedTerm, ...]]]:
-    """Name and model of what is to be fitted, the surest first, and the terms that were added."""
+) -> tuple[dict[str, ProcessModel], tuple[AddedTerm, ...]]:
+    """Models to be fitted by name, the surest first, and the terms that were added to one."""
     variants = variants_of(model)
     for finding in findings:
         if finding.kind == "variant":
             parts = {name: set(v.parameter_names) for name, v in variants.items()}
             least, most = set(model.parameter_names), parts[finding.name]
             within = [name for name, between in parts.items() if least < between < most]
-            return [(name, variants[name], ()) for name in (finding.name, *within)]
+            return {name: variants[name] for name in (finding.name, *within)}, ()
     for finding in findings:
         if finding.term is not None and finding.counts:
             try:
                 added = with_terms(model, [finding.term])
             except ModelError:  # it has a parameter of that name
-                return []
-            return [(description(finding), added, (finding.term,))]
-    return []
+                return {}, ()
+            return {description(finding): added}, (finding.term,)
+    return {}, ()
 
 
 _MODEL = "the model"

@@ -106,8 +106,7 @@ def of_filter(local: Sensitivity) -> tuple[Sensitivity, list[FilteredRun], Backg
     for k, n_steps in enumerate(local.steps):
         response = objective.response(local.chromosome, k, n_steps)
         runs.append(FilteredRun.of(objective, local.chromosome, k, response, workers))
-    bends = np.moveaxis(objective.bends(local.chromosome), 0, 2)
-    bends = np.where(np.isfinite(bends), bends, 0.0)
+    bends = np.moveaxis(np.where(np.isfinite(local.bends), local.bends, 0.0), 0, 2)
     foreseen = (
         _foreseen_noise(runs),
         _noisy_inputs(runs),
