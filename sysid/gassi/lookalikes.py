@@ -17,6 +17,7 @@ And what is hardly felt may have several minima in the noise of what is felt mor
 from __future__ import annotations
 
 import copy
+import itertools
 from typing import Self
 
 import numpy as np
@@ -36,6 +37,8 @@ _TURNED = 3  # parameters that are moved to find twins
 _TURNS = (-0.3, -0.15, 0.15, 0.3)  # by these parts of their ranges
 _DIFFERENCE = 1e-6
 _ACTING = 1e-4  # parameters that move the mode less than this part of what the strongest does
+# A rate is a parameter's if it goes with at least its root, and no other's as fast as that.
+_OWN, _FOREIGN = 0.5, 0.25
 _REACHED = 0.02  # part of the frequency by which the end may miss the alias
 _SCANNED = 8  # places along a direction that only ends of ranges tell
 _SAME = 1e-5  # part of the error by which places that are as good may differ
@@ -45,7 +48,8 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     """Chromosomes (n_free,) in the ranges of which a fast mode is this one's or an alias of it."""
     fastest, dt = _Modes(objective, chromosome), objective.records[0].dt
     swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
-    starts = _harmless(objective, chromosome, [*swapped, *alike], _HARM)
+    traded = _trades(fastest, chromosome)
+    starts = _harmless(objective, chromosome, [*swapped, *traded, *alike], _HARM)
     starts += _beyond_ends(objective, chromosome)
     for modes in (fastest, *fastest.others(2.0 * np.pi * _FASTEST_SEEN / dt)):
         starts += [*_twins(modes), *_aliases(modes, dt)]
@@ -112,6 +116,27 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
     for row, pair in zip(swapped, pairs, strict=True):
         row[pair] = row[pair[::-1]]
     return list(swapped)
+
+
+def _trades(modes: _Modes, chromosome: FloatArray) -> list[FloatArray]:
+    """Chromosomes with the rates of two lags traded, each through one parameter.
+
+    As those of an amplifier and of the winding behind it, which outputs hardly tell apart.
+    """
+    rates, powers = modes.lags(chromosome)
+    trades = []
+    for i, j in itertools.combinations(range(len(rates)), 2):
+        ratio = rates[j] / rates[i]
+        ours, theirs = (
+            np.flatnonzero((np.abs(powers[a]) > _OWN) & (np.abs(powers[b]) < _FOREIGN))
+            for a, b in ((i, j), (j, i))
+        )
+        for k, m in itertools.product(ours, theirs):
+            traded = chromosome.copy()
+            traded[k] *= ratio ** (1.0 / powers[i, k])
+            traded[m] *= ratio ** (-1.0 / powers[j, m])
+            trades.append(traded)
+    return trades
 
 
 def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
@@ -186,6 +211,21 @@ class _Modes:
             modes._look_at(mode)
         return copies
 
+    def lags(self, chromosome: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rates (n,) at which states settle while the others rest, and their powers, (n, n_free).
+
+        With the power k of a parameter, as k = -1 of an inductance, a rate goes by its k-th power.
+        """
+        (rates,) = self._rates(self.start[None])
+        settling = rates > 0.0
+        beside = np.where(np.eye(len(chromosome)) > 0.0, 1.0 + _DIFFERENCE, 1.0) * chromosome
+        changes = self._rates(self.space.encode(beside))[:, settling] / rates[settling] - 1.0
+        return rates[settling], changes.T / _DIFFERENCE
+
+    def _rates(self, at: FloatArray) -> FloatArray:
+        rates: FloatArray = -np.diagonal(self._matrices(at), axis1=1, axis2=2)
+        return rates
+
     def _look_at(self, mode: complex) -> None:
         self.mode, self.acting = mode, np.arange(len(self.start))
         (slopes,) = self.slopes(*self.here(1))
@@ -236,7 +276,11 @@ class _Modes:
         return nearest
 
     def _eigenvalues(self, at: FloatArray) -> ComplexArray:
+        eigenvalues = np.linalg.eigvals(self._matrices(at))
+        return eigenvalues.astype(np.complex128)
+
+    def _matrices(self, at: FloatArray) -> FloatArray:
+        """Of how states change with states, (n, n_states, n_states), zero without a number."""
         vectors = self.space.full(self.space.decode(at))
         matrices = linear_models(self.model, self.x, self.u, vectors).A
-        eigenvalues = np.linalg.eigvals(np.where(np.isfinite(matrices), matrices, 0.0))
-        return eigenvalues.astype(np.complex128)
+        return np.where(np.isfinite(matrices), matrices, 0.0)
