@@ -84,8 +84,8 @@ class Descent:
     iterations in a row that gained nothing, or hardly any of what was promised. level: of
     ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
     smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the
-    other side, because simulations fail on the usual one. cautious: whether all steps are damped,
-    since one has led to where simulations fail.
+    other side, because simulations fail on the usual one. cautious: whether lambda shortens all
+    steps, since one has led to where simulations fail.
     """
 
     point: Point

@@ -23,8 +23,10 @@ quadratic promises to gain is the share -(g'd + d'H d / 2) / E_f. Steps and slop
 the ranges.
 
 Between parameters that are nearly tied diag H is that of a valley's walls, and damping by it turns
-a step away from the valley before it shortens it. So a part of the undamped step is tried as well,
-and, where nothing gains what is promised, lengths of it that are bent with the valley.
+a step away from the valley before it shortens it. So steps with the same damping of all coordinates
+are tried as well, as Levenberg damped them, which are short along the valley and whole across it; a
+part of the undamped step; and, where nothing gains what is promised, lengths of that which are bent
+with the valley.
 """
 
 from __future__ import annotations
@@ -43,11 +45,13 @@ from sysid.problem.space import SearchSpace
 _FACTORS = 5.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 FIRST_DAMPING = 1e-2
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
+# The same damping of all coordinates, in parts of the largest curvature.
+_EQUAL = 10.0 ** np.array([-5.0, -7.0, -9.0, -11.0])
 _HOLDING_ROUNDS = 4  # in which the coordinates that hit a bound are held there
 _PART = 0.1  # of the undamped step, which tells how the valley bends
 _LENGTHS = np.array([1.0, 0.5, 0.25, 0.1, 0.03])  # of the undamped step, bent
 # Simulations of candidates that an iteration takes, straight and bent ones.
-CANDIDATES = 2 * len(_FACTORS) + 1 + len(_LENGTHS)
+CANDIDATES = 2 * len(_FACTORS) + len(_EQUAL) + 1 + len(_LENGTHS)
 _PERTURBATION = 1e-6  # of constraints, in parts of the ranges
 # A slide ends this far inside, in parts of the constraint's slope: on it rounding would decide.
 _MARGIN = 1e-6
@@ -111,19 +115,21 @@ class Candidates:
     """Coordinates that may follow a point, (n, n_free), and the middle lambda then, (n,).
 
     promise: share of the error that the quadratic's own minimum would take away. undamped: whether
-    the last one is part of the way to that minimum.
+    the last one is part of the way to that minimum. short: how many, from the first, are of steps
+    that lambda shortens.
     """
 
     coordinates: FloatArray
     damping: FloatArray
     promise: float
     undamped: bool = False
+    short: int = 0
 
     @property
-    def damped(self) -> Candidates:
-        """Those of damped steps."""
-        n = len(self.coordinates) - self.undamped
-        return Candidates(self.coordinates[:n], self.damping[:n], self.promise)
+    def shortened(self) -> Candidates:
+        """Those of steps that lambda shortens."""
+        n = self.short
+        return Candidates(self.coordinates[:n], self.damping[:n], self.promise, short=n)
 
     def joined(self, more: Candidates) -> Candidates:
         """These and more of the same point, of which none is told apart any more."""
@@ -155,7 +161,9 @@ def candidates(
     lambdas = np.clip(damping[:, None] * np.append(_FACTORS, 0.0), _LEAST_DAMPING, _MOST_DAMPING)
     diagonal = np.diagonal(hessian, axis1=1, axis2=2)
     scale = np.maximum(diagonal, 1e-12 * diagonal.max(axis=1, keepdims=True))
+    equal = diagonal.max(axis=1)[:, None, None] * _EQUAL[:, None] * np.ones(diagonal.shape[1])
     added = lambdas[:, :, None] * scale[:, None]
+    added = np.concatenate([added[:, :-1], equal, added[:, -1:]], axis=1)
     steps = _damped(hessian, gradient, added, low, high)
     beyond = _infeasible(space, at + steps * width)
     if beyond.any() and space.model.constraints:
@@ -173,13 +181,19 @@ def candidates(
     gained = -(steps @ gradient)[..., 0] - 0.5 * np.sum((steps @ hessian) * steps, axis=2)
     promises = gained / np.array([quadratic.error for quadratic in quadratics])[:, None]
     kept = (~beyond & (promises > 0.0))[:, :-1]
-    lighter = np.clip(lambdas / np.sqrt(_FACTORS[-1]), _LEAST_DAMPING, _MOST_DAMPING)
-    # A part of the undamped step after those that are damped, which leaves lambda as it is.
+    n_short = len(_FACTORS)
+    lighter = np.repeat(damping[:, None], added.shape[1], axis=1)  # of steps damped alike, too
+    lighter[:, :n_short] = lambdas[:, :-1]
+    lighter = np.clip(lighter / np.sqrt(_FACTORS[-1]), _LEAST_DAMPING, _MOST_DAMPING)
+    lighter[:, -1] = damping  # the undamped step's part leaves lambda as it is
     undamped = ~beyond[:, -1] & (promises[:, -1] > 0.0) & kept.any(axis=1)
-    coordinates[:, -1], lighter[:, -1] = at[:, 0] + _PART * steps[:, -1] * width, damping
+    coordinates[:, -1] = at[:, 0] + _PART * steps[:, -1] * width
     kept = np.column_stack([kept, undamped])
+    short = kept[:, :n_short].sum(axis=1).tolist()
     return [
-        Candidates(coordinates[k][kept[k]], lighter[k][kept[k]], promise, bool(undamped[k]))
+        Candidates(
+            coordinates[k][kept[k]], lighter[k][kept[k]], promise, bool(undamped[k]), short[k]
+        )
         for k, promise in enumerate(promises.max(axis=1).tolist())
     ]
 
@@ -194,19 +208,25 @@ def bent(
 ) -> Candidates:
     """Candidates from a point (n_free,) bent by what the errors at their ends are not linear by.
 
-    responses: those around the point, and those of the candidates. With s_j = e_j(d) - e_j - J_j d
+    Of those that lambda shortens and of the undamped step. responses: those around the point, and
+    those of the candidates. With s_j = e_j(d) - e_j - J_j d
     a step d goes on by the solution of (H + lambda D) b = -sum_j c_j J_j' s_j (Transtrum & Sethna,
     "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization",
     arXiv:1201.5885, by a finite step). In a narrow valley that bends, straight steps are short.
     Along the undamped step s grows with the square of the length: t d goes on by t^2 b.
     """
     around, ends = responses
+    chosen = [
+        *range(offer.short),
+        *range(len(offer.coordinates) - offer.undamped, len(offer.coordinates)),
+    ]
+    offer = replace(offer, coordinates=offer.coordinates[chosen], damping=offer.damping[chosen])
     space, (lower, upper) = objective.space, bounds
     values, counted = around.values, np.flatnonzero(objective.weights > 0.0)
     slopes = np.zeros((len(offer.coordinates), len(at)))
     with np.errstate(over="ignore", invalid="ignore"):
         for j in counted:
-            change = (ends.values[:, j] - values[:, j, :1]).T
+            change = (ends.values[:, j, chosen] - values[:, j, :1]).T
             slopes += quadratic.factors[j] * (change @ (values[:, j, 1:] - values[:, j, :1]))
         steps = (offer.coordinates - at) / space.width
         slopes = slopes / quadratic.distance - steps @ quadratic.hessian

@@ -5,8 +5,9 @@ An iteration of a descent at x, in search coordinates, takes two or three batche
     1. x and its neighbours x + h_k e_k give the quadratic around x (see ``quadratic``): its
        Hessian H, slope g, and the share of the error that it promises to take away.
     2. Candidates x + d(lambda), (H + lambda D) d = -g, of five values of lambda around the last
-       one, and a part of the undamped step. The best is the next x if it gains anything; lambda
-       falls to a fifth of its own then, and rises 625-fold if none gains.
+       one, some with the same damping of all, and a part of the undamped step. The best is the
+       next x if it gains anything; lambda falls to a fifth of its own then, and rises 625-fold if
+       none gains.
     3. Where none gains half of what the quadratic promises, the same bent with the valley.
 
 Integration steps are chosen for x, are the same for all that is simulated around it, so that
@@ -189,7 +190,7 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     offers = {}
     for i, offer in zip(quadratics, offered, strict=True):
         if len(offer.coordinates) and not offer.promise <= onward[i].tolerance:
-            offers[i] = offer.damped if onward[i].cautious else offer
+            offers[i] = offer.shortened if onward[i].cautious else offer
         else:
             onward[i] = resumed(objective, onward[i], "arrived")
     rows = [offer.coordinates for offer in offers.values()]
@@ -266,13 +267,16 @@ def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Res
         far = np.any(np.abs(at - descent.steps_at) > _FAR * objective.space.width)
         steps_at = None if far else descent.steps_at
         descent = replace(descent, point=point, steps_at=steps_at, gain=gain)
-    promising = offer.promise > NOTHING
-    failed = gain <= 0.0 or (promising and gain < _KEPT * offer.promise)
+    promising, behind = offer.promise > NOTHING, gain < _KEPT * offer.promise
+    little = gain <= descent.tolerance
+    # By less damping more may be gained at once: where a valley bends it is seen only then.
+    once_more = behind and little and not descent.failures
+    failed = gain <= 0.0 or once_more or (behind and promising)
     failures = descent.failures + 1 if failed else 0
     descent = replace(descent, damping=damping, failures=failures)
     if failures >= PATIENCE and promising:
         return resumed(objective, descent, "misled")
-    if failures >= PATIENCE or 0.0 < gain <= descent.tolerance:
+    if failures >= PATIENCE or (little and not failed):
         return resumed(objective, descent, "arrived")
     return descent
 

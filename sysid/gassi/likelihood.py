@@ -54,6 +54,7 @@ _MOVING = 2.0  # deviations that errors of the integration may make on an excerp
 _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _EXPLORED = 2  # minima whose lookalikes are descended from
 _EXPLORED_BY_FILTER = 5  # the same by a filter
+_SHARPER = (1e-4, 1e-6)  # shares of the largest error that each counts for, one after another
 _BETTER = 1.0  # deviance by which one of them has to be better than the one before
 _COMPARED = 0.05  # deviance to which minima are compared: what decides is hundreds of times that
 
@@ -132,6 +133,8 @@ def fit_likelihood(
     )
     if not roughly:
         objective, optima = _in_noise(objective, optima, watch)
+    if noise is None:
+        optima = _sharpened(objective, optima, watch)
     best, *others = optima.ranked()
     refitted = None
     if noise is not None:
@@ -226,13 +229,41 @@ def _explored(
     return optima
 
 
+def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Optima:
+    """Minima compared by all that the best explained outputs tell.
+
+    As an encoder's angle does after many turns. What counts for more than it errs is made to count
+    for less in steps, for the less it does the narrower is the valley that a minimum lies in.
+    """
+    last = LEAST_SHARE
+    for least in _SHARPER:
+        best, *others = optima.ranked()
+        rms = best.rms[objective.weights > 0.0]
+        if rms.min() >= last * rms.max():
+            break
+        near = [o for o in others if optima.deviance(o, best) < _CONCEIVABLE]
+        finer = fine_enough(best.objective, best.chromosome, _bounded(best.rms, least))
+        if finer is not best.objective:
+            objective = objective.finer(finer.simulator.accuracy)
+        optima = Optima(objective, least=least)
+        for optimum in (best, *near):
+            optima.add(_weighed(objective, optimum.chromosome, watch, least=least))
+        last = least
+    return optima
+
+
+def _bounded(rms: FloatArray, least: float) -> FloatArray:
+    """Errors (n_outputs,), none less than a share of the largest."""
+    bounded: FloatArray = np.maximum(rms, max(least * rms.max(), TINY))
+    return bounded
+
+
 def _in_noise(
     objective: Objective, optima: Optima, watch: Watch | None
 ) -> tuple[Objective, Optima]:
     """Minima anew by as many steps as the best one's errors let the data tell, if by more."""
     best, *others = optima.ranked()
-    rms = np.maximum(best.rms, max(LEAST_SHARE * best.rms.max(), TINY))
-    finer = fine_enough(best.objective, best.chromosome, rms)
+    finer = fine_enough(best.objective, best.chromosome, _bounded(best.rms, LEAST_SHARE))
     if finer is best.objective:
         return objective, optima
     near = (optimum for optimum in others if optima.deviance(optimum, best) < _CONCEIVABLE)
@@ -242,7 +273,12 @@ def _in_noise(
 
 
 def _weighed(
-    objective: Objective, chromosome: FloatArray, watch: Watch | None, *, roughly: bool = False
+    objective: Objective,
+    chromosome: FloatArray,
+    watch: Watch | None,
+    *,
+    roughly: bool = False,
+    least: float = LEAST_SHARE,
 ) -> Optimum:
     """The minimum by the inverse of its errors: weights and parameters in turn."""
     tolerance = ROUGHLY if roughly else TOLERANCE
@@ -250,7 +286,7 @@ def _weighed(
     # A refinement may end where a simulation takes more steps than a chromosome is allowed.
     noisy = np.isfinite(rms).all() and not noiseless(objective, chromosome, rms)
     for _ in range(_ROUNDS if noisy else 0):
-        weights = given / np.maximum(rms, max(LEAST_SHARE * rms.max(), TINY))
+        weights = given / _bounded(rms, least)
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
         objective = weighed

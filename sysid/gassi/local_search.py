@@ -22,7 +22,7 @@ _HORIZON = 10  # iterations as good as its last that take a descent with hope be
 _ARRIVED = 3e-4  # share of the error that an iteration gains less than where a descent ends
 # Iterations of the last descent that simulations are kept for; and its most, beyond the budget
 # if need be, for only a minimum means anything.
-_POLISHING, _MOST_ITERATIONS = 15, 50
+_POLISHING, _MOST_ITERATIONS = 10, 50
 _SAME = 1e-3  # share by which an output's error differs between minima, or they are one
 _NEAR = 0.02  # share of the best error within which descents and minima count as near it
 _BEFORE_GIVING_UP = 2  # iterations

@@ -16,8 +16,8 @@ from sysid.uncertainty.colour import colour, longest_memory
 from sysid.uncertainty.sensitivity import Sensitivity, sensitivity
 from sysid.uncertainty.ties import Shown, ties
 
-# An output explained much better than the others keeps this share of the largest error, or the
-# arithmetic of its last digits would decide.
+# While minima are sought an output explained much better than the others counts for this share of
+# the largest error: by less their valleys are too narrow to be gone along from afar.
 LEAST_SHARE = 1e-2
 # Deviance above which one minimum is no rival to another: one in a hundred for the four
 # parameters in which such minima typically differ.
@@ -71,11 +71,14 @@ def chromosomes_of(optima: Sequence[Optimum]) -> tuple[FloatArray, ...]:
 class Optima:
     """Minima far from each other, compared by what the data tell at the first.
 
-    scale: errors of the outputs (n_outputs,) that are alike to start from.
+    scale: errors of the outputs (n_outputs,) that are alike to start from. least: share of the
+    largest error that every one counts for.
     """
 
-    def __init__(self, objective: Objective, scale: FloatArray | float = 1.0) -> None:
-        self._objective, self._scale = objective, np.maximum(scale, TINY)
+    def __init__(
+        self, objective: Objective, scale: FloatArray | float = 1.0, least: float = LEAST_SHARE
+    ) -> None:
+        self._objective, self._scale, self._least = objective, np.maximum(scale, TINY), least
         self._optima: list[Optimum] = []
 
     @classmethod
@@ -120,7 +123,7 @@ class Optima:
 
     def _deviance(self, rms: FloatArray, reference: FloatArray) -> float:
         sizes = np.log(np.maximum([rms, reference], TINY)) - np.log(self._scale)
-        sizes = np.maximum(sizes, sizes.max() + np.log(LEAST_SHARE))
+        sizes = np.maximum(sizes, sizes.max() + np.log(self._least))
         return float(2.0 * np.sum(self._independent_samples * (sizes[0] - sizes[1])))
 
     def connected(self, optimum: Optimum, rivals: Sequence[Optimum]) -> list[bool]:
@@ -177,7 +180,7 @@ class Optima:
         """Fisher information of the coordinates, (n_free, n_free), were errors white."""
         first = self._sensitivity
         rms: FloatArray = np.sqrt(np.mean(first.residual**2, axis=0)) / self._scale
-        rms = self._scale * np.maximum(rms, max(LEAST_SHARE * rms.max(), TINY))
+        rms = self._scale * np.maximum(rms, max(self._least * rms.max(), TINY))
         slopes = (first.slopes / rms[:, None]).reshape(-1, first.slopes.shape[2])
         information: FloatArray = slopes.T @ slopes
         return information

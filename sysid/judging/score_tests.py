@@ -71,6 +71,7 @@ _FEW = 25  # samples for each amplitude, below which what they leave tells no co
 _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one tells
 # Change from first to last of what is nowhere below zero, in parts of its mean: 2, 1 for chance.
 _EMPTIED = 3.0
+_EXACT = 1e-3  # share by which a gain may be off: an angle of many turns may tell far less
 _LEAST = 1e-6  # error of an output in parts of the largest, below which it weighs no more
 _FLAT = 0.999  # of what the best size of a delay explains, that is as good
 _SAME_RATE = 1e-3  # of a sample time
@@ -277,7 +278,13 @@ class _Tests:
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
 
     def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
-        """Whether a parameter that changes stays above zero where physics asks for that."""
+        """Whether it is a fault by its size.
+
+        A gain is off by more than what no sensor holds, and a parameter that changes stays above
+        zero where physics asks for that.
+        """
+        if suspect.kind == "gain":
+            return abs(float(result.amplitudes[0])) > _EXACT
         limits = self._limits.get(suspect.name) if suspect.kind == "change" else None
         return limits is None or limits[0] < 0.0 or abs(result.amplitudes[0]) < _EMPTIED
 

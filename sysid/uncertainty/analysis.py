@@ -29,7 +29,7 @@ from sysid.uncertainty.sensitivity import Sensitivity, bend_errors, sensitivity
 from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
 
 # Standard deviation of a logarithm above which the slopes at the estimate are no guide.
-_WEAK = 0.2
+_WEAK = 0.1
 _AWAY = 0.5  # deviations between an estimate and the minimum that slopes foretell
 _SAMPLED = 40  # points of a range at which it is tried whether simulations fail
 _DRAWS = 20_000  # of all quantities together
