@@ -188,9 +188,10 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     damping = np.array([onward[i].damping for i in quadratics])
     offered = candidates(space, at, ends, damping, list(quadratics.values()))
     offers = {}
-    for i, offer in zip(quadratics, offered, strict=True):
+    for i, whole in zip(quadratics, offered, strict=True):
+        offer = whole.shortened if onward[i].cautious else whole
         if len(offer.coordinates) and not offer.promise <= onward[i].tolerance:
-            offers[i] = offer.shortened if onward[i].cautious else offer
+            offers[i] = offer
         else:
             onward[i] = resumed(objective, onward[i], "arrived")
     rows = [offer.coordinates for offer in offers.values()]

@@ -33,10 +33,10 @@ from sysid.gassi.optima import (
     LEAST_SHARE,
     QUICKLY,
     ROUGHLY,
-    TINY,
     TOLD_APART,
     Optima,
     Optimum,
+    bounded,
     chromosomes_of,
     to_compare,
 )
@@ -242,7 +242,7 @@ def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Opt
         if rms.min() >= last * rms.max():
             break
         near = [o for o in others if optima.deviance(o, best) < _CONCEIVABLE]
-        finer = fine_enough(best.objective, best.chromosome, _bounded(best.rms, least))
+        finer = fine_enough(best.objective, best.chromosome, bounded(best.rms, least))
         if finer is not best.objective:
             objective = objective.finer(finer.simulator.accuracy)
         optima = Optima(objective, least=least)
@@ -252,18 +252,12 @@ def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Opt
     return optima
 
 
-def _bounded(rms: FloatArray, least: float) -> FloatArray:
-    """Errors (n_outputs,), none less than a share of the largest."""
-    bounded: FloatArray = np.maximum(rms, max(least * rms.max(), TINY))
-    return bounded
-
-
 def _in_noise(
     objective: Objective, optima: Optima, watch: Watch | None
 ) -> tuple[Objective, Optima]:
     """Minima anew by as many steps as the best one's errors let the data tell, if by more."""
     best, *others = optima.ranked()
-    finer = fine_enough(best.objective, best.chromosome, _bounded(best.rms, LEAST_SHARE))
+    finer = fine_enough(best.objective, best.chromosome, bounded(best.rms, LEAST_SHARE))
     if finer is best.objective:
         return objective, optima
     near = (optimum for optimum in others if optima.deviance(optimum, best) < _CONCEIVABLE)
@@ -286,7 +280,7 @@ def _weighed(
     # A refinement may end where a simulation takes more steps than a chromosome is allowed.
     noisy = np.isfinite(rms).all() and not noiseless(objective, chromosome, rms)
     for _ in range(_ROUNDS if noisy else 0):
-        weights = given / _bounded(rms, least)
+        weights = given / bounded(rms, least)
         weighed = objective.weighed(weights)
         steady = np.allclose(weighed.weights, objective.weights, rtol=_STEADY)
         objective = weighed

@@ -133,8 +133,9 @@ def _trades(modes: _Modes, chromosome: FloatArray) -> list[FloatArray]:
         )
         for k, m in itertools.product(ours, theirs):
             traded = chromosome.copy()
-            traded[k] *= ratio ** (1.0 / powers[i, k])
-            traded[m] *= ratio ** (-1.0 / powers[j, m])
+            with np.errstate(over="ignore"):  # beyond all ranges anyway
+                traded[k] *= ratio ** (1.0 / powers[i, k])
+                traded[m] *= ratio ** (-1.0 / powers[j, m])
             trades.append(traded)
     return trades
 

@@ -63,6 +63,12 @@ def to_compare(objective: Objective) -> Objective:
     return objective.uneased.exact_means if isinstance(objective, Innovations) else objective
 
 
+def bounded(rms: FloatArray, least: float) -> FloatArray:
+    """Errors (n_outputs,), none less than a share of the largest."""
+    errors: FloatArray = np.maximum(rms, max(least * rms.max(), TINY))
+    return errors
+
+
 def chromosomes_of(optima: Sequence[Optimum]) -> tuple[FloatArray, ...]:
     """Where minima are, (n_free,) each."""
     return tuple(optimum.chromosome for optimum in optima)
@@ -180,7 +186,7 @@ class Optima:
         """Fisher information of the coordinates, (n_free, n_free), were errors white."""
         first = self._sensitivity
         rms: FloatArray = np.sqrt(np.mean(first.residual**2, axis=0)) / self._scale
-        rms = self._scale * np.maximum(rms, max(self._least * rms.max(), TINY))
+        rms = self._scale * bounded(rms, self._least)
         slopes = (first.slopes / rms[:, None]).reshape(-1, first.slopes.shape[2])
         information: FloatArray = slopes.T @ slopes
         return information
