@@ -132,6 +132,15 @@ def tangents(model: ProcessModel) -> Tangents:
     return Tangents(kernel, *_compiled(model, text, {}, ("simulate",)))
 
 
+def is_differentiable(model: ProcessModel) -> bool:
+    """Whether a model has ``tangents``."""
+    try:
+        tangents(model)
+    except ModelError:
+        return False
+    return True
+
+
 @dataclass(frozen=True)
 class SampleLanes:
     """A model's compiled functions of ``SampleKernel``; key: fingerprint of what they do."""

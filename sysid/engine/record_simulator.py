@@ -7,7 +7,8 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.bends import in_parts, splines_of, with_bends
-from sysid.engine.compiler import Filter, Kernels, Tangents, explained_errors, kernels
+from sysid.engine.compiler import Filter, Kernels, explained_errors, kernels
+from sysid.engine.compiler import tangents as compiled_tangents
 from sysid.engine.filter_kernel import FilterKernel
 from sysid.engine.filter_settings import FilterSettings
 from sysid.engine.intervals import Intervals, IntervalSlopes
@@ -289,26 +290,39 @@ class RecordSimulator:
             self._colour(kernel, settings), settings.corrects,
         )  # fmt: skip
 
-    def tangents(
-        self, tangents: Tangents, parameters: FloatArray, starts: FloatArray, n_steps: int
-    ) -> FloatArray:
+    @property
+    def weights(self) -> FloatArray:
+        """Parts of an output that make its residual, (n_samples, n_outputs), 0 of lost samples."""
+        return self._weights
+
+    def tangents(self, parameters: FloatArray, starts: FloatArray, n_steps: int) -> FloatArray:
         """Tangents of the outputs of up to LANES rows at so many steps per sample.
 
         parameters: (n, 2 n_parameters), each behind its own the direction in which they move;
-        starts: likewise (n, 2 n_states). Returns (n_samples, n_outputs, n).
+        starts: likewise (n, 2 n_states). Returns (n_samples, n_outputs, n). Raises ModelError as
+        ``compiler.tangents``.
         """
+        model, q = self.kernels.model, self._measured.shape[1]
+        tangents = compiled_tangents(
+            with_integrals(model, self.averaged) if self.averaged else model
+        )
         kernel, n = tangents.kernel, len(parameters)
+        nothing = np.zeros((n, len(self.averaged)))
+        at, moves = np.split(starts, 2, axis=1)
+        starts = np.hstack([at, nothing, moves, nothing])
         padded = np.arange(LANES) % n
-        kept = np.empty((*self._measured.shape, LANES))
+        kept = np.empty((self.record.n_samples, q + len(self.averaged), LANES))
         work = work_area(kernel.work_rows * LANES)
-        with explained_errors(self.kernels.model):
+        with explained_errors(model):
             tangents.simulate(
                 work, work.reshape(-1, LANES), kernel.tables, self._inputs,
-                np.zeros_like(self._measured), np.ones_like(self._measured),
+                np.zeros(kept.shape[:2]), np.ones(kept.shape[:2]),
                 np.ascontiguousarray(starts[padded].T), np.ascontiguousarray(parameters[padded].T),
                 self.record.dt, n_steps, np.empty((2 * kernel.n_outputs, LANES)), kept,
             )  # fmt: skip
-        return kept[..., :n]
+        for i, j in enumerate(self.averaged):
+            kept[:, j] = average(kept[:, j], kept[:, q + i] / self.record.dt, self._windows[j])
+        return kept[:, :q, :n]
 
     def block(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.bends import bent
-from sysid.engine.compiler import Filter, kalman_filter, kernels, tangents
+from sysid.engine.compiler import Filter, kalman_filter, kernels
 from sysid.engine.filter_settings import FilterSettings
 from sysid.engine.linear_response import LinearResponse
 from sysid.engine.record_simulator import RecordSimulator, blocks_of
@@ -303,17 +303,19 @@ class BatchSimulator:
         records: Sequence[Dataset],
         directions: FloatArray,
         n_steps: IntArray,
-        starts: Sequence[FloatArray | None] | None = None,
+        starts: Sequence[FloatArray] | None = None,
         start_directions: Sequence[FloatArray] | None = None,
+        scales: Sequence[FloatArray] | None = None,
     ) -> list[FloatArray]:
         """How the outputs of free runs move along directions of the parameters and the starts.
 
         parameters: (n, n_parameters). directions: (n, n_directions, n_parameters), of each row of
         them. n_steps: (n, n_records), integration steps per sample, through which the tangents are
         exact. starts: per record, (n, n_states), default the record's own; start_directions: per
-        record, (n, n_directions, n_states), default zero. Returns for each record
-        (n, n_samples, n_outputs, n_directions), not finite where a simulation failed. Raises
-        ModelError for equations that cannot be differentiated.
+        record, (n, n_directions, n_states), default zero. scales: as of ``residuals``, whose
+        tangents are returned then, zero where a sample was lost; default those of the outputs.
+        Returns for each record (n, n_samples, n_outputs, n_directions), not finite where a
+        simulation failed. Raises ModelError for equations that cannot be differentiated.
 
         >>> from sysid.examples import lag
         >>> record = Dataset(np.ones(4), np.zeros(4), dt=0.05)
@@ -322,7 +324,7 @@ class BatchSimulator:
         >>> tangents.round(3).ravel()
         array([0.   , 0.632, 0.865, 0.95 ])
         """
-        parameters, compiled = self._check(parameters, records), tangents(self.model)
+        parameters = self._check(parameters, records)
         n, n_directions = directions.shape[:2]
         lanes = np.concatenate(_each_beside(parameters, directions), axis=1)
         values: list[FloatArray] = []
@@ -338,12 +340,13 @@ class BatchSimulator:
             rows = np.concatenate(_each_beside(start, moves), axis=1)
             values.append(np.empty((record.n_samples, len(self.model.outputs), len(rows))))
             steps = np.repeat(n_steps[:, r], n_directions)
-            tasks += [(r, self._on(record), rows, *run) for run in _runs(steps)]
+            simulator = self._on(record, None if scales is None else scales[r])
+            tasks += [(r, simulator, rows, *run) for run in _runs(steps)]
 
         def run(task: tuple[int, RecordSimulator, FloatArray, slice, int]) -> None:
             r, simulator, from_starts, rows, steps = task
-            part = simulator.tangents(compiled, lanes[rows], from_starts[rows], steps)
-            values[r][..., rows] = part
+            part = simulator.tangents(lanes[rows], from_starts[rows], steps)
+            values[r][..., rows] = part if scales is None else part * simulator.weights[..., None]
 
         self._workers.each(run, tasks)
         return [

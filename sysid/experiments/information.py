@@ -124,7 +124,7 @@ class Informant:
         n_channels = LANES if n_draws else 0
         quiet = np.zeros((n, n_channels))
         along = np.zeros((n, n_free + n_starts + n_draws, len(model.parameters)))
-        along[:, :n_free, : vectors.shape[1]] = self._directions(chromosomes)[:, :n_free]
+        along[:, :n_free, : vectors.shape[1]] = self._space.directions(chromosomes)[:, :n_free]
         along[:, n_free + n_starts :, vectors.shape[1] :] = np.eye(n_draws, n_channels)
         moved = np.zeros((*along.shape[:2], len(model.states)))
         moved[:, np.arange(n_starts) + n_free, unknown] = 1.0
@@ -212,17 +212,6 @@ class Informant:
         moving = lengths[:, 0] > 0.0
         normed: FloatArray = directions[moving] / lengths[moving]
         return normed
-
-    def _directions(self, chromosomes: FloatArray) -> FloatArray:
-        """How parameters move with each search coordinate, (n, n_free, n_parameters)."""
-        space = self._space
-        increments = np.where(space.log, chromosomes, 1.0)
-        directions = np.zeros((*chromosomes.shape, len(space.base)))
-        for k, place in enumerate(space.index):
-            directions[:, k, place] = increments[:, k]
-        for tie in space.ties:
-            directions[:, :, tie.index] = tie.factor * directions[:, :, tie.source]
-        return directions
 
 
 def tells_nothing_there(information: FloatArray, null: FloatArray) -> bool:

@@ -26,7 +26,8 @@ TOLERANCE = 1e-7  # share of the error that ends a descent where nothing else is
 PATIENCE = 3  # failures in a row, the later ones with more damping
 NOTHING = 1e-3  # share of the error that is not worth a change of perturbations
 _STEADIER, _BRACINGS = 1.5, 3
-_NEAR = 1e-3  # parts of the ranges within which integration steps need not be chosen anew
+# Parts of the ranges within which integration steps, and corrections, need not be chosen anew.
+_NEAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,20 @@ FREE = Restriction()
 
 
 @dataclass(frozen=True)
+class Shift:
+    """What residuals by the objective's simulations are more than by those of a descent.
+
+    at: (n_free,), where. steps: of those simulations, per sample, for each record; coarse: the
+    descent's. values: (n_residuals, n_outputs).
+    """
+
+    at: FloatArray
+    steps: tuple[int, ...]
+    coarse: tuple[int, ...]
+    values: FloatArray
+
+
+@dataclass(frozen=True)
 class Descent:
     """A descent at a point; ``refinement.advance`` returns it one iteration further.
 
@@ -85,7 +100,8 @@ class Descent:
     ``PERTURBATIONS``. error_of_round: the error where the present round of levels began.
     smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the
     other side, because simulations fail on the usual one. cautious: whether lambda shortens all
-    steps, since one has led to where simulations fail.
+    steps, since one has led to where simulations fail. shift: of a descent by coarse simulations,
+    which their residuals are corrected by.
     """
 
     point: Point
@@ -105,6 +121,7 @@ class Descent:
     cautious: bool = False
     tolerance: float = TOLERANCE
     restriction: Restriction = FREE
+    shift: Shift | None = None
 
     @property
     def floor(self) -> float:
@@ -115,7 +132,7 @@ class Descent:
         """The state in plain values and arrays, of one that nothing restricts."""
         at, error = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
         state = vars(self) | vars(self.point) | {"sure": at, "sure_error": error}
-        del state["point"], state["safe"], state["restriction"]
+        del state["point"], state["safe"], state["restriction"], state["shift"]
         return state
 
     @classmethod
@@ -195,6 +212,14 @@ def resolve(objective: Objective, descent: Descent) -> Descent | None:
     return replace(descent, steps=steps, steps_at=at, failures=0)
 
 
+def correct(objective: Objective, descent: Descent) -> Descent | None:
+    """The coarse simulations corrected anew, where they were some way back."""
+    shift, width = descent.shift, objective.space.width
+    if shift is None or np.all(np.abs(descent.point.at - shift.at) <= _NEAR * width):
+        return None
+    return replace(descent, shift=None, failures=0)
+
+
 def refocus(_: Objective, descent: Descent) -> Descent | None:
     """The smallest perturbations once more, where larger ones have gained something."""
     at, error = descent.point.at, descent.point.error
@@ -203,7 +228,7 @@ def refocus(_: Objective, descent: Descent) -> Descent | None:
     return replace(descent, steps_at=at, level=0, failures=0, error_of_round=error)
 
 
-_ARRIVED = (sharpen, resolve, refocus)
+_ARRIVED = (sharpen, resolve, correct, refocus)
 STRATEGIES: dict[str, tuple[Callable[[Objective, Descent], Descent | None], ...]] = {
     "failed": (retreat,),  # the simulation of the point fails
     "burst": (brace,),  # those of neighbours leave that of the point by far

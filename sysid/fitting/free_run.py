@@ -106,18 +106,21 @@ def accurate(objective: Objective, chromosome: FloatArray) -> Objective:
 def fine_enough(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> Objective:
     """The objective by as many steps as noise lets it tell, at a minimum (n_free,).
 
+    Its descents still go by those that it has, or else by those that are given here.
     rms: (n_outputs,), of the errors there, none of which is zero. Errors of the steps that a
     search goes by are small beside an output, but may be large beside its noise, as of an encoder.
     """
-    first = last = objective.steps_needed(chromosome[None])
-    changed = True
+    given, first = objective, objective.steps_needed(chromosome[None])
+    last, changed = first, True
     while objective.simulator.accuracy > _FINEST and last.max() < _FAR_MORE * first.max():
         if changed and not _swayed(objective, chromosome, last, rms):
             break
         objective = objective.finer(_FINER * objective.simulator.accuracy)
         steps = objective.steps_needed(chromosome[None])
         changed, last = bool(np.any(steps != last)), steps
-    return objective
+    if objective is given or given.slopes_by is not None:
+        return objective
+    return objective.with_slopes_by(given.simulator)
 
 
 def noiseless(objective: Objective, chromosome: FloatArray, rms: FloatArray) -> bool:

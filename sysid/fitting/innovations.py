@@ -113,7 +113,7 @@ class Innovations(Objective):
     ) -> Self:
         """An objective's counterpart; near: (n_free,), whose free runs tell of the motion."""
         variant = cls.__new__(cls)
-        vars(variant).update(vars(objective))
+        vars(variant).update(vars(objective), slopes_by=None, exact_slopes=False)
         variant.colour = [np.zeros(len(r.input_noise)) for r in objective.records]
         if corrects:
             variant.records = [each_mean_once(record) for record in objective.records]

@@ -20,6 +20,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
+from sysid.engine.compiler import is_differentiable
 from sysid.engine.simulation import BatchResult, BatchSimulator, Residuals
 from sysid.problem.data import Dataset, output_scale
 from sysid.problem.model import ModelError
@@ -53,6 +54,22 @@ class Responses:
         return Responses(self.values[..., :0], rms, np.concatenate([self.excess, more.excess]))
 
 
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals at a point, and how they change beside it.
+
+    residual: (n_residuals, n_outputs). slopes: (n_residuals, n_outputs, n_free), by coordinates in
+    parts of their ranges. rms: (n_outputs,). excess: as of ``Point``. errors: (n_free,), of the
+    neighbours that slopes are differences to, infinite of those without a number.
+    """
+
+    residual: FloatArray
+    slopes: FloatArray
+    rms: FloatArray
+    excess: float
+    errors: FloatArray
+
+
 def smoothed(rms: FloatArray, floor: float) -> FloatArray:
     """Root mean squares, those below the floor f by the parabola (r^2 / f + f) / 2.
 
@@ -73,6 +90,8 @@ class Objective:
     output that is explained too well to decide, and a crease would only lead descents astray.
     ``given``: (n, n_parameters), independent
     changes of the fixed parameters, one standard deviation each, which the intervals count.
+    ``slopes_by``: coarser simulations that descents take slopes and steps by, if any.
+    ``exact_slopes``: whether slopes are tangents, rather than differences of simulations.
     """
 
     def __init__(
@@ -102,6 +121,8 @@ class Objective:
             name = simulator.model.output_names[unseen[0]]
             raise ModelError(f"no record has a measured sample of output {name!r}")
         self.smooth = False
+        self.slopes_by: BatchSimulator | None = None
+        self.exact_slopes = False
         self._counter = [0]
 
     @property
@@ -168,6 +189,21 @@ class Objective:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
         return self.simulated_by(self.simulator.finer(accuracy))
 
+    def with_slopes_by(self, simulator: BatchSimulator) -> Self:
+        """The same objective, whose descents go by coarser simulations, and end by its own."""
+        return self._with(slopes_by=simulator)
+
+    @property
+    def coarse(self) -> Self:
+        """The objective by the simulations that descents go by, this one if by its own."""
+        if self.slopes_by is None:
+            return self
+        return self._with(simulator=self.slopes_by, slopes_by=None)
+
+    def as_fine_as(self, finer: Objective) -> Self:
+        """The same objective by another's simulations of the same model, and its slopes."""
+        return self._with(simulator=finer.simulator, slopes_by=finer.slopes_by)
+
     def simulated_by(self, simulator: BatchSimulator) -> Self:
         """The same objective by other simulations; counts go on together."""
         return self._with(simulator=simulator)
@@ -197,6 +233,44 @@ class Objective:
         rms = self._roots(simulated.sse.sum(axis=1))
         return Responses(simulated.values, rms, simulated.excess.max(axis=1))
 
+    def with_exact_slopes(self) -> Self:
+        """The same objective with exact slopes, if its equations can be differentiated."""
+        return self._with(exact_slopes=is_differentiable(self.simulator.model))
+
+    def tangents(self, chromosomes: FloatArray, n_steps: IntArray) -> FloatArray:
+        """Slopes of the residuals of free runs by search coordinates, through the steps exact.
+
+        n_steps: (n, n_records). (n, n_residuals, n_outputs, n_free), as of ``residuals``.
+        """
+        space, model = self.space, self.simulator.model
+        n, shared = len(chromosomes), len(space.index)
+        starts: list[list[tuple[int, int]]] = [[] for _ in self.records]
+        for column, (place, state) in enumerate(space.estimated, shared):
+            starts[place].append((column, state))
+        most = max(map(len, starts), default=0)
+        along = np.zeros((n, shared + most, len(model.parameters)))
+        along[:, :shared] = space.directions(chromosomes)
+        moves = [np.zeros((n, shared + most, len(model.states))) for _ in self.records]
+        for move, places in zip(moves, starts, strict=True):
+            for i, (column, state) in enumerate(places):
+                increments = chromosomes[:, column] if space.log[column] else 1.0
+                move[:, shared + i, state] = increments
+        parts = self.simulator.tangents(
+            space.full(chromosomes), self.records, along, n_steps, self._starts(chromosomes),
+            moves, self.scales,
+        )  # fmt: skip
+        self._counter[0] += n * (shared + most)
+        slopes = np.zeros(
+            (n, self.n_residuals // len(model.outputs), len(model.outputs), len(space.parameters))
+        )
+        end = 0
+        for part, places in zip(parts, starts, strict=True):
+            rows = slice(end, end := end + part.shape[1])
+            slopes[:, rows, :, :shared] = part[..., :shared]
+            for i, (column, _) in enumerate(places):
+                slopes[:, rows, :, column] = part[..., shared + i]
+        return slopes
+
     def with_sample(self, responses: Responses, residual: FloatArray) -> Responses:
         """Responses with one residual more, (n,), as if of the output that counts most."""
         output = int(np.argmax(self.weights))
@@ -206,6 +280,13 @@ class Objective:
         rms[:, output] = np.hypot(rms[:, output], residual / np.sqrt(self.counts[output]))
         values = np.concatenate([responses.values, row]) if responses.values.size else row[:0]
         return replace(responses, values=values, rms=rms)
+
+    def shifted(self, responses: Responses, shift: FloatArray) -> Responses:
+        """Responses with residuals that are more by (n_residuals, n_outputs)."""
+        values = responses.values + shift[..., None]
+        with np.errstate(over="ignore", invalid="ignore"):  # where a simulation failed
+            rms = self._roots(np.sum(values**2, axis=0).T)
+        return replace(responses, values=values, rms=np.where(np.isfinite(rms), rms, np.inf))
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""

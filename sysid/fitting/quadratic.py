@@ -26,7 +26,11 @@ Between parameters that are nearly tied diag H is that of a valley's walls, and 
 a step away from the valley before it shortens it. So steps with the same damping of all coordinates
 are tried as well, as Levenberg damped them, which are short along the valley and whole across it; a
 part of the undamped step; and, where nothing gains what is promised, lengths of that which are bent
-with the valley.
+with the valley. With exact slopes all of these are led back into the valley instead: they tell a
+floor from walls that are a hundred million times as steep, which differences do not.
+
+H is never summed up, for then only a hundred million remain of what 53 bits can tell: with
+orthogonal factors of the J_j, weighed and one above the other, it is H = R'R.
 """
 
 from __future__ import annotations
@@ -38,20 +42,22 @@ from typing import Self
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.fitting.objective import Objective, Responses, smoothed
+from sysid.fitting.objective import Linearisation, Objective, Responses, smoothed
 from sysid.problem.space import SearchSpace
 
 # The values of lambda that are tried, in parts of the middle one.
 _FACTORS = 5.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 FIRST_DAMPING = 1e-2
-_LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
+_LEAST_DAMPING, _LEAST_BY_TANGENTS, _MOST_DAMPING = 1e-14, 1e-18, 1e6
 # The same damping of all coordinates, in parts of the largest curvature.
 _EQUAL = 10.0 ** np.array([-5.0, -7.0, -9.0, -11.0])
+_ROWS = 1024  # that are made orthogonal at once
 _HOLDING_ROUNDS = 4  # in which the coordinates that hit a bound are held there
 _PART = 0.1  # of the undamped step, which tells how the valley bends
-_LENGTHS = np.array([1.0, 0.5, 0.25, 0.1, 0.03])  # of the undamped step, bent
+_LENGTHS = np.array([1.0, 0.5, 0.25, 0.1, 0.03])  # of the undamped step
 # Simulations of candidates that an iteration takes, straight and bent ones.
 CANDIDATES = 2 * len(_FACTORS) + len(_EQUAL) + 1 + len(_LENGTHS)
+_RESTORING = 1e-10  # as of ``_EQUAL``, of steps back into a valley: they are not to go along it
 _PERTURBATION = 1e-6  # of constraints, in parts of the ranges
 # A slide ends this far inside, in parts of the constraint's slope: on it rounding would decide.
 _MARGIN = 1e-6
@@ -61,53 +67,71 @@ _SHORTENINGS, _SHORTER = 6, 0.4
 
 @dataclass(frozen=True)
 class Quadratic:
-    """H (n_free, n_free), g (n_free,) and the smoothed error E_f at the point.
+    """R, (n_free, n_free), q, (n_free,), and the smoothed error E_f at the point.
 
-    factors: c, (n_outputs,). distance: (n_free,), of the neighbours.
+    factors: c, (n_outputs,). floor: the least lambda. lengths: parts of the undamped step that are
+    tried.
     """
 
-    hessian: FloatArray
-    gradient: FloatArray
+    root: FloatArray
+    right: FloatArray
     error: float
     factors: FloatArray
-    distance: FloatArray
+    floor: float
+    lengths: FloatArray
 
     @classmethod
-    def at(
-        cls, objective: Objective, around: Responses, distance: FloatArray, floor: float
-    ) -> Self:
-        """At a point, by the responses there and at distances (n_free,) from it."""
-        rms, weights = around.rms[0], objective.weights
+    def at(cls, objective: Objective, around: Linearisation, floor: float) -> Self:
+        """At a point, by the residuals and slopes there; floor: of the outputs' errors."""
+        rms, weights = around.rms, objective.weights
         c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
-        counted = np.flatnonzero(weights > 0.0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            changes = around.values[..., 1:] - around.values[..., :1]
-            hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
-            if not np.all(np.isfinite(gradient)):
-                changes = np.where(np.isfinite(changes), changes, 0.0)
-                hessian, gradient = _summed(changes, around.values[..., 0], c, counted)
-            hessian, gradient = hessian / np.outer(distance, distance), gradient / distance
+        slopes = around.slopes
+        if not np.isfinite(slopes).all():
+            slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        root, right = _orthogonalised(slopes, around.residual, c)
         error = float(smoothed(rms, floor) @ weights)
-        return cls(hessian, gradient, error, c, distance)
+        least, lengths = _LEAST_DAMPING, np.array([_PART])
+        if objective.exact_slopes:
+            least, lengths = _LEAST_BY_TANGENTS, _LENGTHS
+        return cls(root, right, error, c, least, lengths)
+
+    @property
+    def hessian(self) -> FloatArray:
+        """H, (n_free, n_free)."""
+        return self.root.T @ self.root
+
+    @property
+    def gradient(self) -> FloatArray:
+        """g, (n_free,)."""
+        return self.root.T @ self.right
 
     @property
     def leads_somewhere(self) -> bool:
         """Whether it is finite and not flat; slopes at the edge of stability may overflow."""
-        finite = np.isfinite(self.hessian).all() and np.isfinite(self.gradient).all()
-        return bool(finite and np.diag(self.hessian).max() > 0.0)
+        finite = np.isfinite(self.root).all() and np.isfinite(self.right).all()
+        return bool(finite and self.root.any())
 
 
-def _summed(
-    changes: FloatArray, residual: FloatArray, c: FloatArray, counted: IntArray
+def _orthogonalised(
+    slopes: FloatArray, residual: FloatArray, c: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Sums of c_j J_j' J_j and of c_j J_j' e_j over the outputs that count."""
-    n = changes.shape[2]
-    hessian, gradient = np.zeros((n, n)), np.zeros(n)
-    for j in counted:
-        rows = changes[:, j]
-        hessian += c[j] * (rows.T @ rows)
-        gradient += c[j] * (residual[:, j] @ rows)
-    return hessian, gradient
+    """R and q of sum_j c_j |J_j d + e_j|^2 = |R d + q|^2 + what no step d changes.
+
+    H = R'R would lose what is told by less than 1e-8 of the most.
+    """
+    counted, n = np.flatnonzero(c > 0.0), slopes.shape[2]
+    rows = np.concatenate([slopes, residual[..., None]], axis=2)[:, counted]
+    rows = (rows * np.sqrt(c[counted])[:, None]).reshape(-1, n + 1)
+    whole = len(rows) // _ROWS * _ROWS
+    blocks = _triangle(rows[:whole].reshape(-1, _ROWS, n + 1))
+    rows = np.concatenate([blocks.reshape(-1, n + 1), rows[whole:], np.zeros((n + 1, n + 1))])
+    triangle = _triangle(rows)
+    return triangle[:n, :n], triangle[:n, n]
+
+
+def _triangle(rows: FloatArray) -> FloatArray:
+    """Triangles R of matrices A, (..., m, n), with R'R = A'A, (..., min(m, n), n)."""
+    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -152,25 +176,27 @@ def candidates(
     """
     if not quadratics:
         return []
-    hessian = np.stack([quadratic.hessian for quadratic in quadratics])
-    gradient = np.stack([quadratic.gradient for quadratic in quadratics])[:, :, None]
+    root = np.stack([quadratic.root for quadratic in quadratics])
+    right = np.stack([quadratic.right for quadratic in quadratics])
+    floor = np.array([quadratic.floor for quadratic in quadratics])
     lower, upper = (ends[:, None] for ends in bounds)
     at, width = at[:, None], space.width
     low, high = (lower - at) / width, (upper - at) / width
     # The last one is for the promise.
-    lambdas = np.clip(damping[:, None] * np.append(_FACTORS, 0.0), _LEAST_DAMPING, _MOST_DAMPING)
-    diagonal = np.diagonal(hessian, axis1=1, axis2=2)
+    lambdas = damping[:, None] * np.append(_FACTORS, 0.0)
+    lambdas = np.clip(lambdas, floor[:, None], _MOST_DAMPING)
+    diagonal = np.sum(root**2, axis=1)
     scale = np.maximum(diagonal, 1e-12 * diagonal.max(axis=1, keepdims=True))
     equal = diagonal.max(axis=1)[:, None, None] * _EQUAL[:, None] * np.ones(diagonal.shape[1])
     added = lambdas[:, :, None] * scale[:, None]
     added = np.concatenate([added[:, :-1], equal, added[:, -1:]], axis=1)
-    steps = _damped(hessian, gradient, added, low, high)
+    steps = _damped(root, right, added, low, high)
     beyond = _infeasible(space, at + steps * width)
     if beyond.any() and space.model.constraints:
         for k in np.flatnonzero(beyond.any(axis=1)).tolist():
             limits = Constraints.at(space, at[k, 0], width)
             for j in np.flatnonzero(beyond[k]).tolist():
-                curvature = hessian[k] + np.diag(added[k, j])
+                curvature = quadratics[k].hessian + np.diag(added[k, j])
                 steps[k, j] = limits.slid(steps[k, j], curvature, low[k, 0], high[k, 0])
     for _ in range(_SHORTENINGS):
         if not beyond.any():
@@ -178,24 +204,26 @@ def candidates(
         beyond[beyond] = _infeasible(space, (at + steps * width)[beyond])
         steps[beyond] *= _SHORTER
     coordinates = np.clip(at + steps * width, lower, upper)
-    gained = -(steps @ gradient)[..., 0] - 0.5 * np.sum((steps @ hessian) * steps, axis=2)
+    changes = steps @ np.swapaxes(root, 1, 2)
+    gained = -np.sum(changes * (right[:, None] + 0.5 * changes), axis=2)
     promises = gained / np.array([quadratic.error for quadratic in quadratics])[:, None]
     kept = (~beyond & (promises > 0.0))[:, :-1]
     n_short = len(_FACTORS)
     lighter = np.repeat(damping[:, None], added.shape[1], axis=1)  # of steps damped alike, too
     lighter[:, :n_short] = lambdas[:, :-1]
-    lighter = np.clip(lighter / np.sqrt(_FACTORS[-1]), _LEAST_DAMPING, _MOST_DAMPING)
-    lighter[:, -1] = damping  # the undamped step's part leaves lambda as it is
+    lighter = np.clip(lighter / np.sqrt(_FACTORS[-1]), floor[:, None], _MOST_DAMPING)
     undamped = ~beyond[:, -1] & (promises[:, -1] > 0.0) & kept.any(axis=1)
-    coordinates[:, -1] = at[:, 0] + _PART * steps[:, -1] * width
-    kept = np.column_stack([kept, undamped])
     short = kept[:, :n_short].sum(axis=1).tolist()
-    return [
-        Candidates(
-            coordinates[k][kept[k]], lighter[k][kept[k]], promise, bool(undamped[k]), short[k]
-        )
-        for k, promise in enumerate(promises.max(axis=1).tolist())
-    ]
+    offers = []
+    for k, promise in enumerate(promises.max(axis=1).tolist()):
+        rows, dampings = coordinates[k, :-1][kept[k]], lighter[k, :-1][kept[k]]
+        if undamped[k]:  # lambda stays as it is
+            lengths = quadratics[k].lengths
+            along = at[k] + lengths[:, None] * steps[k, -1] * width
+            rows = np.concatenate([rows, np.clip(along, lower[k], upper[k])])
+            dampings = np.concatenate([dampings, np.full(len(lengths), damping[k])])
+        offers.append(Candidates(rows, dampings, promise, bool(undamped[k]), short[k]))
+    return offers
 
 
 def bent(
@@ -204,49 +232,86 @@ def bent(
     bounds: tuple[FloatArray, FloatArray],
     quadratic: Quadratic,
     offer: Candidates,
-    responses: tuple[Responses, Responses],
+    around: Linearisation,
+    ends: Responses,
 ) -> Candidates:
     """Candidates from a point (n_free,) bent by what the errors at their ends are not linear by.
 
-    Of those that lambda shortens and of the undamped step. responses: those around the point, and
-    those of the candidates. With s_j = e_j(d) - e_j - J_j d
-    a step d goes on by the solution of (H + lambda D) b = -sum_j c_j J_j' s_j (Transtrum & Sethna,
-    "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares minimization",
-    arXiv:1201.5885, by a finite step). In a narrow valley that bends, straight steps are short.
-    Along the undamped step s grows with the square of the length: t d goes on by t^2 b.
+    Of those that lambda shortens and of the undamped step. around: the point; ends: of the
+    candidates. With s_j = e_j(d) - e_j - J_j d a step d goes on by the solution of
+    (H + lambda D) b = -sum_j c_j J_j' s_j (Transtrum & Sethna, "Improvements to the
+    Levenberg-Marquardt algorithm for nonlinear least-squares minimization", arXiv:1201.5885, by a
+    finite step). In a narrow valley that bends, straight steps are short. Along the undamped step s
+    grows with the square of the length: t d goes on by t^2 b.
     """
-    around, ends = responses
     chosen = [
         *range(offer.short),
         *range(len(offer.coordinates) - offer.undamped, len(offer.coordinates)),
     ]
     offer = replace(offer, coordinates=offer.coordinates[chosen], damping=offer.damping[chosen])
     space, (lower, upper) = objective.space, bounds
-    values, counted = around.values, np.flatnonzero(objective.weights > 0.0)
-    slopes = np.zeros((len(offer.coordinates), len(at)))
+    steps = (offer.coordinates - at) / space.width
+    pushes = np.zeros(offer.coordinates.shape)
     with np.errstate(over="ignore", invalid="ignore"):
-        for j in counted:
-            change = (ends.values[:, j, chosen] - values[:, j, :1]).T
-            slopes += quadratic.factors[j] * (change @ (values[:, j, 1:] - values[:, j, :1]))
-        steps = (offer.coordinates - at) / space.width
-        slopes = slopes / quadratic.distance - steps @ quadratic.hessian
-    diagonal = np.diag(quadratic.hessian)
+        for j in np.flatnonzero(objective.weights > 0.0):
+            slopes = around.slopes[:, j]
+            surplus = ends.values[:, j, chosen].T - around.residual[:, j] - steps @ slopes.T
+            pushes += quadratic.factors[j] * (surplus @ slopes)
+    diagonal = np.sum(quadratic.root**2, axis=0)
     scale = np.maximum(diagonal, 1e-12 * diagonal.max())
     added = np.sqrt(_FACTORS[-1]) * offer.damping[:, None] * scale
     if offer.undamped:
-        added[-1] = _LEAST_DAMPING * scale
+        added[-1] = quadratic.floor * scale
     free = (offer.coordinates > lower) & (offer.coordinates < upper)
-    systems = np.where(free[:, :, None] & free[:, None], quadratic.hessian, 0.0)
-    places = np.arange(len(at))
-    systems[:, places, places] += np.where(free, added, 1.0)
-    moves = _solved(systems, np.where(free, -slopes, 0.0))
+    moves = _led(quadratic.root, added, free, pushes)
     coordinates, damping = offer.coordinates + moves * space.width, offer.damping
     if offer.undamped:
         t = _LENGTHS[:, None] / _PART
         lengths = at + t * (offer.coordinates[-1] - at) + t**2 * moves[-1] * space.width
         coordinates = np.concatenate([coordinates[:-1], lengths])
         damping = np.append(damping[:-1], np.full(len(lengths), damping[-1]))
-    coordinates = np.clip(coordinates, lower, upper)
+    return _kept(offer, objective.space, np.clip(coordinates, lower, upper), damping)
+
+
+def restored(
+    objective: Objective,
+    at: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    quadratic: Quadratic,
+    offer: Candidates,
+    around: Linearisation,
+    ends: Responses,
+) -> Candidates:
+    """Candidates from a point (n_free,) that have left a narrow valley, back in it; as ``bent``.
+
+    Of all of them. The valley bends as the square of a step along it, and its walls may be a
+    hundred million times as steep as its floor. From the errors e(d) at the end of a step d, and
+    the slopes J where it began, b = -(H + mu I)^-1 sum_j c_j J_j' e_j(d) leads back: the walls
+    hardly turn within a step, and mu keeps b from going along the valley.
+    """
+    space, (lower, upper) = objective.space, bounds
+    pushes = np.zeros(offer.coordinates.shape)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for j in np.flatnonzero(objective.weights > 0.0):
+            pushes += quadratic.factors[j] * (ends.values[:, j].T @ around.slopes[:, j])
+    free = (offer.coordinates > lower) & (offer.coordinates < upper)
+    mu = _RESTORING * np.sum(quadratic.root**2, axis=0).max() * np.ones(free.shape)
+    moves = _led(quadratic.root, mu, free, pushes)
+    coordinates = np.clip(offer.coordinates + moves * space.width, lower, upper)
+    return _kept(offer, space, coordinates, offer.damping)
+
+
+def _led(root: FloatArray, added: FloatArray, free: BoolArray, pushes: FloatArray) -> FloatArray:
+    """Steps b of free coordinates with (R'R + added) b = -pushes, (n, n_free) each."""
+    triangles = _triangles(root[None], added, ~free)
+    halves = _solved(np.swapaxes(triangles, 1, 2), np.where(free, -pushes, 0.0))
+    return _solved(triangles, halves)
+
+
+def _kept(
+    offer: Candidates, space: SearchSpace, coordinates: FloatArray, damping: FloatArray
+) -> Candidates:
+    """Of coordinates (n, n_free) those that may be simulated, in the place of an offer's."""
     kept = np.flatnonzero(np.isfinite(coordinates).all(axis=1))
     kept = kept[~_infeasible(space, coordinates[kept])]
     return replace(offer, coordinates=coordinates[kept], damping=damping[kept], undamped=False)
@@ -265,33 +330,52 @@ def _infeasible(space: SearchSpace, coordinates: FloatArray) -> BoolArray:
 
 
 def _damped(
-    hessian: FloatArray, gradient: FloatArray, added: FloatArray, low: FloatArray, high: FloatArray
+    root: FloatArray, right: FloatArray, added: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
     """Minima of damped quadratics between bounds on the step, by holding what hits them.
 
-    hessian: (m, n_free, n_free), gradient: (m, n_free, 1); added: (m, n, n_free), lambda D of n
-    steps of each; low, high: (m, 1, n_free).
+    root: (m, n_free, n_free), right: (m, n_free); added: (m, n, n_free), lambda D of n steps of
+    each; low, high: (m, 1, n_free).
     """
-    down = -gradient[:, None, :, 0]
+    across = np.swapaxes(root, 1, 2)
+    down = -(across @ right[..., None])[..., 0][:, None]
     # A direction held by a bound and pushed against it would only shorten the step.
     pushed = ((low >= 0.0) & (down < 0.0)) | ((high <= 0.0) & (down > 0.0))
     held = np.repeat(pushed, added.shape[1], axis=1)
     steps = np.zeros(added.shape)
-    diagonal = np.arange(added.shape[2])
-    live = np.arange(len(hessian))
+    live = np.arange(len(root))
     for _ in range(_HOLDING_ROUNDS):
         if not len(live):
             break
         stay = held[live]
-        # A held coordinate's row says that it moves as far as it does.
-        systems = np.where(stay[..., None], 0.0, hessian[live, None])
-        systems[..., diagonal, diagonal] += np.where(stay, 1.0, added[live])
-        solutions = _solved(systems, np.where(stay, steps[live], down[live]))
+        fixed = np.where(stay, steps[live], 0.0)
+        wanted = -right[live, None] - fixed @ across[live]
+        triangles = _triangles(root[live, None], added[live], stay, wanted)
+        solutions = _solved(triangles[..., :-1, :-1], triangles[..., :-1, -1])
+        solutions = np.where(stay, fixed, solutions)
         out = ~stay & ((solutions < low[live]) | (solutions > high[live]))
         steps[live] = np.clip(solutions, low[live], high[live])
         held[live] |= out
         live = live[out.any(axis=(1, 2))]
     return np.where(np.isfinite(steps), steps, 0.0)
+
+
+def _triangles(
+    root: FloatArray, added: FloatArray, stay: BoolArray, wanted: FloatArray | None = None
+) -> FloatArray:
+    """Triangles T with T'T = R'R + added, (..., n_free, n_free), of coordinates that do not stay.
+
+    root: (..., n_free, n_free); added, stay: (..., n_free). wanted: (..., n_free), a column more,
+    from which follows the step d whose R d is nearest to it.
+    """
+    n = added.shape[-1]
+    columns = n if wanted is None else n + 1
+    rows, places = np.zeros((*added.shape[:-1], 2 * n, columns)), np.arange(n)
+    rows[..., :n, :n] = np.where(stay[..., None, :], 0.0, root)
+    rows[..., n + places, places] = np.where(stay, 1.0, np.sqrt(added))
+    if wanted is not None:
+        rows[..., :n, n] = wanted
+    return _triangle(rows)
 
 
 def _solved(systems: FloatArray, right: FloatArray) -> FloatArray:

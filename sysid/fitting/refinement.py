@@ -35,10 +35,19 @@ from sysid.fitting.descent import (
     Descent,
     Point,
     Restriction,
+    Shift,
     resumed,
 )
-from sysid.fitting.objective import FLOORS, Objective, Responses
-from sysid.fitting.quadratic import CANDIDATES, Candidates, Quadratic, bent, candidates, heavier
+from sysid.fitting.objective import FLOORS, Linearisation, Objective, Responses
+from sysid.fitting.quadratic import (
+    CANDIDATES,
+    Candidates,
+    Quadratic,
+    bent,
+    candidates,
+    heavier,
+    restored,
+)
 from sysid.problem.space import SearchSpace
 
 MOST_ITERATIONS = 50
@@ -47,6 +56,7 @@ _KEPT = 0.02  # share of the promise below which a gain counts as a failure
 _LITTLE = 0.5  # share of the promise below which the valley bends
 _FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
 _BURST = 10.0  # a neighbour's error that is so much larger has left the edge of stability
+_OF_TETHER = 1e-6  # parts of the ranges, of differences that a tether's slopes are by
 _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
 
 
@@ -114,9 +124,13 @@ def refine_each(
     anew = iter(objective.rms(np.stack(lacking)) if lacking else ())
     rms = [next(anew) if p.accurate_rms is None else p.accurate_rms for p in points]
     return [
-        Refinement(end, descent.point.error, errors, descent.iterations, descent.steps)
+        Refinement(end, descent.point.error, errors, descent.iterations, _final_steps(descent))
         for end, descent, errors in zip(ends, descents, rms, strict=True)
     ]
+
+
+def _final_steps(descent: Descent) -> tuple[int, ...]:
+    return descent.steps if descent.shift is None else descent.shift.steps
 
 
 def begin(
@@ -153,17 +167,17 @@ def simulations_per_iteration(objective: Objective) -> int:
 
 def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     """Gauss-Newton Hessian of the error at coordinates (n_free,), in parts of the ranges."""
-    (descent,) = _with_steps(objective, [Descent(Point(at))])
-    (around,) = _responses(objective, [descent], [_neighbourhood(objective.space, descent)])
-    floor = FLOORS[0] * float(objective.error_of(around.rms[:1])[0])
-    return Quadratic.at(objective, around, _distance(objective.space, descent), floor).hessian
+    descents, objective = _ready(objective, [Descent(Point(at))]), objective.coarse
+    (around,) = _linearised(objective, descents)
+    floor = FLOORS[0] * float(objective.error_of(around.rms[None])[0])
+    return Quadratic.at(objective, around, floor).hessian
 
 
 def advance(objective: Objective, descents: Sequence[Descent]) -> list[Descent]:
     """The descents after one iteration of each that has not finished."""
     onward = list(descents)
     live = [i for i, descent in enumerate(descents) if not descent.finished]
-    ready = _with_steps(objective, [descents[i] for i in live])
+    ready, objective = _ready(objective, [descents[i] for i in live]), objective.coarse
     residuals_each = objective.n_residuals * (1 + len(objective.space.parameters))
     per_batch = max(1, _BATCH_BYTES // (8 * residuals_each))
     for first in range(0, len(live), per_batch):
@@ -177,8 +191,7 @@ def advance(objective: Objective, descents: Sequence[Descent]) -> list[Descent]:
 def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents, whose integration steps are chosen, after one iteration."""
     space = objective.space
-    neighbourhoods = [_neighbourhood(space, descent) for descent in descents]
-    around = _responses(objective, descents, neighbourhoods)
+    around = _linearised(objective, descents)
     surveys = [_surveyed(objective, *pair) for pair in zip(descents, around, strict=True)]
     onward = [descent for descent, _ in surveys]
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
@@ -197,13 +210,14 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     rows = [offer.coordinates for offer in offers.values()]
     tried = dict(zip(offers, _responses(objective, [onward[i] for i in offers], rows), strict=True))
     curved = {
-        i: bent(
+        i: (restored if objective.exact_slopes else bent)(
             objective,
             onward[i].point.at,
             onward[i].restriction.bounds(space),
             quadratics[i],
             offer,
-            (around[i], tried[i]),
+            around[i],
+            tried[i],
         )
         for i, offer in offers.items()
         if _gains(objective, onward[i], tried[i]).max() < _LITTLE * offer.promise
@@ -218,24 +232,23 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
 
 
 def _surveyed(
-    objective: Objective, descent: Descent, around: Responses
+    objective: Objective, descent: Descent, around: Linearisation
 ) -> tuple[Descent, Quadratic | None]:
     """The descent with its point's error, and the quadratic there unless it stalls or ends."""
-    errors = objective.error_of(around.rms)
-    at, error = descent.point.at, float(errors[0])
+    at, error = descent.point.at, float(objective.error_of(around.rms[None])[0])
     if not np.isfinite(error):
         return resumed(objective, descent, "failed"), None
     safe = descent.steps_at is not None and np.array_equal(at, descent.steps_at)
     descent = replace(
         descent,
-        point=Point(at, error, around.rms[0], float(around.excess[0])),
+        point=Point(at, error, around.rms, around.excess),
         safe=Point(at, error) if safe else descent.safe,
         gain=0.0,
         iterations=descent.iterations + 1,
     )
     if error <= ROUNDING:
         return replace(descent, finished=True), None
-    burst = ~(errors[1:] <= _BURST + error)
+    burst = ~(around.errors <= _BURST + error)
     if burst.any():
         braced = resumed(objective, descent, "burst")
         if not braced.finished:
@@ -244,11 +257,10 @@ def _surveyed(
         if turned != descent.backward:
             return replace(descent, backward=turned), None
         # The rest of the parameters go on alone.
-        around.values[..., 1:][..., burst] = around.values[..., :1]
+        around.slopes[..., burst] = 0.0
     if not np.isfinite(descent.error_of_round):
         descent = replace(descent, error_of_round=error)
-    distance = _distance(objective.space, descent)
-    quadratic = Quadratic.at(objective, around, distance, descent.floor)
+    quadratic = Quadratic.at(objective, around, descent.floor)
     if not quadratic.leads_somewhere:
         return resumed(objective, descent, "arrived"), None
     return descent, quadratic
@@ -266,8 +278,8 @@ def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Res
         error = float(objective.error_of(ends.rms[best : best + 1])[0])
         point = Point(at, error, ends.rms[best], float(ends.excess[best]))
         far = np.any(np.abs(at - descent.steps_at) > _FAR * objective.space.width)
-        steps_at = None if far else descent.steps_at
-        descent = replace(descent, point=point, steps_at=steps_at, gain=gain)
+        steps_at, shift = (None, None) if far else (descent.steps_at, descent.shift)
+        descent = replace(descent, point=point, steps_at=steps_at, shift=shift, gain=gain)
     promising, behind = offer.promise > NOTHING, gain < _KEPT * offer.promise
     little = gain <= descent.tolerance
     # By less damping more may be gained at once: where a valley bends it is seen only then.
@@ -289,6 +301,30 @@ def _gains(objective: Objective, descent: Descent, ends: Responses) -> FloatArra
     errors = objective.smoothed_error_of(rms, descent.floor)
     gains: FloatArray = (errors[0] - errors[1:]) / errors[0]
     return gains
+
+
+def _ready(objective: Objective, descents: list[Descent]) -> list[Descent]:
+    """The descents with what their simulations go by, steps and what corrects them."""
+    coarse = objective.coarse
+    descents = list(_with_steps(coarse, descents))
+    lacking = {
+        i: descent
+        for i, descent in enumerate(descents)
+        if coarse is not objective
+        and (descent.shift is None or descent.shift.coarse != descent.steps)
+    }
+    if not lacking:
+        return descents
+    at = np.stack([descent.point.at for descent in lacking.values()])
+    chromosomes = objective.space.decode(at)
+    steps = objective.steps_needed(chromosomes)
+    exact = objective.residuals(chromosomes, steps).values
+    fewer = np.array([descent.steps for descent in lacking.values()])
+    less = coarse.residuals(chromosomes, fewer).values
+    for k, (i, descent) in enumerate(lacking.items()):
+        shift = Shift(at[k], tuple(steps[k].tolist()), descent.steps, (exact - less)[..., k])
+        descents[i] = replace(descent, shift=shift)
+    return descents
 
 
 def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:
@@ -321,6 +357,54 @@ def _neighbourhood(space: SearchSpace, descent: Descent) -> FloatArray:
     return np.vstack([at, at + np.diag(distance * space.width)])
 
 
+def _linearised(objective: Objective, descents: list[Descent]) -> list[Linearisation]:
+    """Residuals and slopes where descents stand, by their steps."""
+    space = objective.space
+    if not objective.exact_slopes:
+        rows = [_neighbourhood(space, descent) for descent in descents]
+        around = _responses(objective, descents, rows)
+        return [
+            _by_differences(objective, responses, _distance(space, descent))
+            for responses, descent in zip(around, descents, strict=True)
+        ]
+    rows = [descent.point.at[None] for descent in descents]
+    steps = np.array([descent.steps for descent in descents])
+    tangents = objective.tangents(space.decode(np.concatenate(rows)), steps)
+    return [
+        _by_tangents(objective, descent, *pair)
+        for descent, *pair in zip(
+            descents, _responses(objective, descents, rows), tangents, strict=True
+        )
+    ]
+
+
+def _by_differences(objective: Objective, around: Responses, distance: FloatArray) -> Linearisation:
+    with np.errstate(over="ignore", invalid="ignore"):  # slopes at the edge of stability
+        slopes = (around.values[..., 1:] - around.values[..., :1]) / distance
+    errors = objective.error_of(around.rms[1:])
+    excess = float(around.excess[0])
+    return Linearisation(around.values[..., 0], slopes, around.rms[0], excess, errors)
+
+
+def _by_tangents(
+    objective: Objective, descent: Descent, here: Responses, tangents: FloatArray
+) -> Linearisation:
+    """tangents: (n_samples, n_outputs, n_free), by the search coordinates."""
+    space, tether = objective.space, descent.restriction.tether
+    slopes = tangents * space.width
+    if tether is not None:
+        shift = _OF_TETHER * np.diag(space.width)
+        ahead, behind = (
+            tether(space.decode(descent.point.at + way * shift)) for way in (1.0, -1.0)
+        )
+        row = np.zeros((1, *slopes.shape[1:]))
+        row[0, int(np.argmax(objective.weights))] = (ahead - behind) / (2.0 * _OF_TETHER)
+        slopes = np.concatenate([slopes, row])
+    error = float(objective.error_of(here.rms)[0])
+    errors = np.where(np.isfinite(slopes).all(axis=(0, 1)), error, np.inf)
+    return Linearisation(here.values[..., 0], slopes, here.rms[0], float(here.excess[0]), errors)
+
+
 def _responses(
     objective: Objective, descents: list[Descent], rows: list[FloatArray], *, keep: bool = True
 ) -> list[Responses]:
@@ -332,12 +416,15 @@ def _responses(
     counts = [len(rows[i]) for i in order]
     steps = np.repeat([descents[i].steps for i in order], counts, axis=0)
     chromosomes = objective.space.decode(np.concatenate([rows[i] for i in order]))
-    batch = objective.residuals(chromosomes, steps, keep=keep)
+    corrected = any(descent.shift is not None for descent in descents)
+    batch = objective.residuals(chromosomes, steps, keep=keep or corrected)
     parts: dict[int, Responses] = {}
     for i, end in zip(order, np.cumsum(counts), strict=True):
         part = slice(end - len(rows[i]), end)
         responses = Responses(batch.values[..., part], batch.rms[part], batch.excess[part])
-        tether = descents[i].restriction.tether
+        shift, tether = descents[i].shift, descents[i].restriction.tether
+        if shift is not None:
+            responses = objective.shifted(responses, shift.values)
         if tether is not None:
             responses = objective.with_sample(responses, tether(chromosomes[part]))
         parts[i] = responses

@@ -250,7 +250,8 @@ class GASSI(RecordEstimator):
         self.output_weights_: FloatArray = objective.weights
         self._rivals: tuple[FloatArray, ...] = ()
         self._ridge: tuple[FloatArray, ...] = ()
-        self._final_accuracy = self.accuracy
+        self._final_accuracy = self._slopes_accuracy = self.accuracy
+        self._exact_slopes = False
         self.criterion_, self.criterion_reason_ = self._criterion(data, preset)
         self.output_noise_: FloatArray | None = None
         self.least_noise_: FloatArray | None = None
@@ -375,6 +376,8 @@ class GASSI(RecordEstimator):
             result = fit(objective, minima, begun=replace(begun, chromosomes=()), explored=True)
         likeliest, self._rivals, self._ridge = result.optimum, result.rivals, result.ridge
         self._final_accuracy = likeliest.objective.simulator.accuracy
+        self._slopes_accuracy = likeliest.objective.coarse.simulator.accuracy
+        self._exact_slopes = likeliest.objective.exact_slopes
         self._set_evaluated(self._at_final_accuracy(objective), likeliest.chromosome)
         self.output_weights_ = likeliest.objective.weights
         if isinstance(likeliest.objective, Innovations):
@@ -524,8 +527,17 @@ class GASSI(RecordEstimator):
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""
-        accuracy = self._final_accuracy
-        return objective.finer(accuracy) if accuracy < self.accuracy else objective
+        if self._exact_slopes:
+            objective = objective.with_exact_slopes()
+        accuracy, given = self._final_accuracy, objective
+        if accuracy < self.accuracy:
+            objective = objective.finer(accuracy)
+        if accuracy == self._slopes_accuracy:
+            return objective
+        slopes_by = given.simulator
+        if self._slopes_accuracy < self.accuracy:
+            slopes_by = slopes_by.finer(self._slopes_accuracy)
+        return objective.with_slopes_by(slopes_by)
 
     def _step(self, dt: float | None) -> float:
         if self.dt is None:

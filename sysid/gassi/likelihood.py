@@ -244,7 +244,8 @@ def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Opt
         near = [o for o in others if optima.deviance(o, best) < _CONCEIVABLE]
         finer = fine_enough(best.objective, best.chromosome, bounded(best.rms, least))
         if finer is not best.objective:
-            objective = objective.finer(finer.simulator.accuracy)
+            objective = objective.as_fine_as(finer)
+        objective = objective.with_exact_slopes()
         optima = Optima(objective, least=least)
         for optimum in (best, *near):
             optima.add(_weighed(objective, optimum.chromosome, watch, least=least))
@@ -262,7 +263,7 @@ def _in_noise(
         return objective, optima
     near = (optimum for optimum in others if optima.deviance(optimum, best) < _CONCEIVABLE)
     minima = chromosomes_of([best, *near])
-    objective = objective.finer(finer.simulator.accuracy)
+    objective = objective.as_fine_as(finer)
     return objective, _explored(objective, minima, watch, lookalike=False)
 
 

@@ -251,6 +251,20 @@ class SearchSpace:
             vectors[..., tie.index] = tie.factor * vectors[..., tie.source]
         return vectors
 
+    def directions(self, chromosomes: FloatArray) -> FloatArray:
+        """How parameters move with each search coordinate, (n, n_coordinates, n_parameters).
+
+        Of the coordinates of parameters, in their order; starts move none.
+        """
+        n = len(self.index)
+        increments = np.where(self.log[:n], chromosomes[:, :n], 1.0)
+        directions = np.zeros((len(chromosomes), n, len(self.base)))
+        for k, place in enumerate(self.index):
+            directions[:, k, place] = increments[:, k]
+        for tie in self.ties:
+            directions[:, :, tie.index] = tie.factor * directions[:, :, tie.source]
+        return directions
+
     def feasible(self, chromosome: FloatArray) -> bool:
         """Whether all limits and constraints hold of a chromosome, (n_free,)."""
         return bool(np.all(self.violations(chromosome[None]) <= 0.0))

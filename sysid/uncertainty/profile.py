@@ -1,5 +1,6 @@
 """Profile likelihood: how much worse the best fit becomes as one parameter is moved."""
 
+import itertools
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
@@ -24,7 +25,8 @@ _BLIND_SHARE = 0.05
 _RESOLUTION = 0.02  # of the statistic, to which refits go
 _REFITS, _NEAR = 20, 0.1  # of one end, until the root of the statistic is so near its level,
 _GAP = 0.02  # or two fits on both sides of it so near each other, in parts of the way there
-_LEAP = 8.0  # times the distance, that the next point may be away at most
+# Times the distance, that the next point may be away at most, and where a valley has branches.
+_LEAP, _CAREFUL = 8.0, 1.5
 _TETHER = 200.0  # loss of likelihood by a quantity that is a standard deviation off its place
 _BEYOND = 3.0  # widths of a range to which its open end is searched
 
@@ -79,13 +81,15 @@ class Fit(NamedTuple):
     """A fit of all parameters to a place of a quantity.
 
     at: (n_free,), search coordinates. loss: what its error is more than the estimate's by the same
-    integration steps, whose own errors may be larger than what is to be told.
+    integration steps, whose own errors may be larger than what is to be told. alone: whether it
+    does not explain less only because of where it began: from elsewhere the descent ended worse.
     """
 
     place: float
     statistic: float
     at: FloatArray
     loss: float
+    alone: bool = False
 
     @property
     def root(self) -> float:
@@ -94,10 +98,13 @@ class Fit(NamedTuple):
 
 
 class Wanted(NamedTuple):
-    """A place that a fit is wanted for, and search coordinates (n_free,) near it."""
+    """A place that a fit is wanted for, and search coordinates (n_free,) near it.
+
+    A descent begins from the best of each group: a valley may have branches.
+    """
 
     place: float
-    near: tuple[FloatArray, ...]
+    groups: tuple[tuple[FloatArray, ...], ...]
 
 
 _Result = TypeVar("_Result")
@@ -139,26 +146,30 @@ def _fitted(
     least: errors of the estimate by integration steps, those that are met are added.
     """
     objective, estimate = tasks[0][0].objective, tasks[0][0].local.chromosome
-    ends = refine_each(objective, _begun(objective, tasks), _ITERATIONS)
+    refined = iter(refine_each(objective, _begun(objective, tasks), _ITERATIONS))
+    each = [list(itertools.islice(refined, len(wanted.groups))) for _, wanted in tasks]
+    ends = [min(ended, key=lambda end: end.error) for ended in each]
+    worse = [max(end.error for end in ended) for ended in each]
     for steps in {end.steps for end in ends if np.isfinite(end.error)} - least.keys():
         rms = objective.residuals(estimate[None], steps, keep=False).rms
         least[steps] = float(objective.error_of(rms)[0])
     fits = []
-    for (tracer, wanted), end in zip(tasks, ends, strict=True):
+    for (tracer, wanted), end, worst in zip(tasks, ends, worse, strict=True):
         loss = end.error - least.get(end.steps, 0.0)
         at = objective.space.encode(end.chromosome)
-        fits.append(Fit(wanted.place, tracer.statistic(loss), at, loss))
+        alone = tracer.statistic(worst - end.error) > Z95**2
+        fits.append(Fit(wanted.place, tracer.statistic(loss), at, loss, alone))
     return fits
 
 
 def _begun(objective: Objective, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Descent]:
-    """A descent to each place, from the best of what is near."""
-    offered = [tracer.begun(wanted.place, at) for tracer, wanted in tasks for at in wanted.near]
+    """Descents to each place, from the best of each group of what is near."""
+    groups = [(tracer, wanted.place, near) for tracer, wanted in tasks for near in wanted.groups]
+    offered = [tracer.begun(place, at) for tracer, place, near in groups for at in near]
     errors = iter(errors_of(objective, offered))
     descents = iter(offered)
     return [
-        min((next(errors), i, next(descents)) for i in range(len(wanted.near)))[2]
-        for _, wanted in tasks
+        min((next(errors), i, next(descents)) for i in range(len(near)))[2] for *_, near in groups
     ]
 
 
@@ -227,9 +238,14 @@ class Tracer:
         if sign * (end - inside.place) <= 0.0:
             return None
         beyond = halve = False
+        leap = _LEAP
         for _ in range(_REFITS):
-            place = self._next(sign, end, inside, outside, halve=halve)
+            place = self._next(sign, end, inside, outside, halve=halve, leap=leap)
             fit = yield self._wanted(place, fits)
+            if fit.alone and fit.statistic <= Z95**2:
+                # What lies beyond was of another branch of the valley.
+                fits = [each for each in fits if each.statistic <= Z95**2]
+                outside, leap = None, _CAREFUL
             fits.append(fit)
             repeated = outside is not None and place == outside.place
             halve, beyond = beyond == (fit.statistic > Z95**2), fit.statistic > Z95**2
@@ -250,16 +266,24 @@ class Tracer:
         return self.quantity.value(inside.place + share * (outside.place - inside.place))
 
     def _next(
-        self, sign: float, end: float, inside: Fit, outside: Fit | None, *, halve: bool
+        self,
+        sign: float,
+        end: float,
+        inside: Fit,
+        outside: Fit | None,
+        *,
+        halve: bool,
+        leap: float,
     ) -> float:
         """The place to fit next on the way to an end, between fits on both sides of the level.
 
-        halve: where a straight root misled, the last two fits are on one side.
+        halve: where a straight root misled, the last two fits are on one side. leap: as of
+        ``_LEAP``.
         """
         out = abs(inside.place - self.centre)
         if outside is None:
             # The root of the statistic is nearly straight, if it is felt at all.
-            growth = float(np.clip(1.2 * Z95 / max(inside.root, 1e-3), 1.5, _LEAP))
+            growth = float(np.clip(1.2 * Z95 / max(inside.root, 1e-3), 1.5, leap))
             step = out * growth if out > 0.0 else Z95 * self.unit
             return self.centre + sign * min(step, abs(end - self.centre))
         apart = abs(outside.place - inside.place)
@@ -297,14 +321,21 @@ class Tracer:
         return Fit(self.centre, 0.0, self.start, 0.0)
 
     def _wanted(self, place: float, fits: Sequence[Fit]) -> Wanted:
-        """A fit to a place, from where fits near it lead: one, the way between two, three."""
+        """A fit to a place, from where fits near it lead, and those alone that explain the data."""
         nodes: list[Fit] = []
         for fit in sorted(fits, key=lambda fit: abs(fit.place - place)):
             if np.isfinite(fit.statistic) and fit.place not in [node.place for node in nodes]:
                 nodes.append(fit)
-        near = [nodes[0].at, nodes[0].at + (place - nodes[0].place) * self.direction]
-        near += [_led(place, nodes[:n]) for n in (2, 3) if len(nodes) >= n]
-        return Wanted(place, tuple(near))
+        within = [node for node in nodes if node.statistic <= Z95**2]
+        # What lies beyond the level may be of another branch, which from there is the nearer one.
+        kinds = [nodes] if len(within) in (0, len(nodes)) else [nodes, within]
+        return Wanted(place, tuple(self._near(place, nodes) for nodes in kinds))
+
+    def _near(self, place: float, nodes: Sequence[Fit]) -> tuple[FloatArray, ...]:
+        """Where one fit leads, the way between two, and three."""
+        straight = nodes[0].at + (place - nodes[0].place) * self.direction
+        led = [_led(place, nodes[:n]) for n in (2, 3) if len(nodes) >= n]
+        return (nodes[0].at, straight, *led)
 
 
 def _led(place: float, nodes: Sequence[Fit]) -> FloatArray:

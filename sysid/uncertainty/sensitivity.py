@@ -88,7 +88,7 @@ class Sensitivity:
 
 
 def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
-    """Residuals and slopes at a chromosome, (n_free,), by central differences.
+    """Residuals and slopes at a chromosome, (n_free,), by central differences, or exact ones.
 
     All simulations of a record take as many steps as the most demanding of them needs. Where one
     on one side fails the difference is that on the other side; where both do the slope is zero.
@@ -96,6 +96,10 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     jumps, which differences would take for slopes. So do a filter's corrections: of each residual
     that side counts whose slope is the same farther away.
     """
+    if objective.exact_slopes:
+        exact = _by_tangents(objective, chromosome)
+        if np.isfinite(exact.slopes).all():
+            return exact
     share: FloatArray | float = 1.0
     criterion, corrects = objective, filters(objective)
     perturbation = _FILTER_PERTURBATION if corrects else _PERTURBATION
@@ -126,6 +130,18 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     return Sensitivity(
         objective, chromosome, steps, residual, seen, slopes, factors, sides < 2, criterion
     )
+
+
+def _by_tangents(objective: Objective, chromosome: FloatArray) -> Sensitivity:
+    steps = objective.steps_needed(chromosome[None])
+    residual = objective.residuals(chromosome[None], steps).values[..., 0]
+    slopes = objective.tangents(chromosome[None], steps)[0]
+    seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
+    failing = np.zeros(len(chromosome), dtype=bool)
+    return Sensitivity(
+        objective, chromosome, steps[0].tolist(), residual, seen, slopes, np.ones(seen.shape),
+        failing, objective,
+    )  # fmt: skip
 
 
 def slopes_along(local: Sensitivity, directions: FloatArray) -> FloatArray:

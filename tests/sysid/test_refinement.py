@@ -504,6 +504,25 @@ def test_it_resolves_what_needs_more_steps_than_where_it_came_from(without):
     assert coarse.chromosome[0] == pytest.approx(exact / 1.01, rel=1e-6)
 
 
+def test_a_descent_by_coarse_simulations_ends_where_exact_ones_would(without):
+    outputs = 2.0 * SINE + 0.01 * np.random.default_rng(0).normal(size=100)
+    exact, start = SINE @ outputs / (SINE @ SINE), np.array([1.0])
+    target, rough = (
+        gain_objective(Formula, by_gain, outputs[:, None])
+        for by_gain in (
+            lambda p, u: p["gain"] * u,
+            lambda p, u: (1.01 * p["gain"] + 0.01 * p["gain"] ** 2) * u,
+        )
+    )
+    assert abs(refine(rough, start).chromosome[0] / exact - 1.0) > 0.02
+    corrected = target.with_slopes_by(rough.simulator)
+    end = refine(corrected, start)
+    assert end.chromosome[0] == pytest.approx(exact, rel=5e-4)
+    assert end.error == pytest.approx(target.evaluate(end.chromosome[None])[0][0], rel=1e-3)
+    once = without(stalls.correct, corrected, start)
+    assert abs(once.chromosome[0] / exact - 1.0) > 5e-4
+
+
 HERE = Point(np.array([math.log(1.8)]), 0.1, np.array([0.1]))
 
 
@@ -517,6 +536,8 @@ HERE = Point(np.array([math.log(1.8)]), 0.1, np.array([0.1]))
         (stalls.sharpen, {"point": Point(HERE.at, 0.1, np.zeros(1)), "smoothing": 2}),
         (stalls.resolve, {"steps": (1,), "steps_at": HERE.at + 1e-3}),
         (stalls.resolve, {"steps": (3,), "steps_at": HERE.at + 1.0}),
+        (stalls.correct, {}),
+        (stalls.correct, {"shift": stalls.Shift(HERE.at, (2,), (1,), np.zeros((100, 1)))}),
         (stalls.refocus, {"level": 0, "error_of_round": 1.0}),
         (stalls.refocus, {"level": 2, "error_of_round": 0.10001}),
     ],

@@ -1,12 +1,24 @@
 """Tangents of simulated outputs against complex steps of an independent integrator."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sysid import BatchSimulator, Input, ModelError, Output, Parameter, ProcessModel, State
+from sysid import (
+    BatchSimulator,
+    Dataset,
+    Input,
+    ModelError,
+    Output,
+    Parameter,
+    ProcessModel,
+    SearchSpace,
+    State,
+)
+from sysid.fitting.objective import Objective
 from tests.sysid.support import blank
 
 DT = 0.01
@@ -179,3 +191,29 @@ def test_equations_that_cannot_be_differentiated_are_refused_in_words():
             np.ones((1, 1, 3)),
             np.ones((1, 1), int),
         )
+
+
+def test_slopes_of_residuals_are_those_of_differences():
+    """Of records that start anywhere, of means over windows, and of samples that were lost."""
+    n, rng = 40, np.random.default_rng(3)
+    states = State("y", "m"), State("v", "m/s"), State("z", "1", initial_range=(-1.0, 1.0))
+    model = replace(oscillator(), states=states)
+    windows = np.zeros((n, 2, 2))
+    windows[:, 1] = -0.7 * DT, 0.4 * DT
+    records = []
+    for seed in (4, 5):
+        outputs = rng.standard_normal((n, 2))
+        outputs[7:9, 1] = np.nan
+        records.append(Dataset(record(n, seed).inputs, outputs, DT, windows=windows))
+    space = SearchSpace.of(model).with_starts(records)
+    objective = Objective(BatchSimulator(model), space, records)
+    at = space.encode(np.array([*VALUES.values(), 0.3, -0.2]))
+    steps = np.array([[2, 3]])
+    exact = objective.tangents(space.decode(at[None]), steps)[0]
+    shift = 1e-5 * np.eye(len(at))
+    ahead, behind = (
+        objective.residuals(space.decode(at + way * shift), steps[0]).values for way in (1.0, -1.0)
+    )
+    differences = (ahead - behind) / 2e-5
+    assert exact == pytest.approx(differences, abs=1e-7 * np.abs(differences).max())
+    assert not exact[7:9, 1].any() and not exact[:n, :, -1].any() and exact[n:, :, -1].any()
