@@ -187,7 +187,7 @@ class Objective:
 
     def finer(self, accuracy: float) -> Self:
         """The same objective by simulations of another accuracy, stiff ones given the steps."""
-        return self.simulated_by(self.simulator.finer(accuracy))
+        return self._with(simulator=self.simulator.finer(accuracy))
 
     def with_slopes_by(self, simulator: BatchSimulator) -> Self:
         """The same objective, whose descents go by coarser simulations, and end by its own."""
@@ -205,8 +205,8 @@ class Objective:
         return self._with(simulator=finer.simulator, slopes_by=finer.slopes_by)
 
     def simulated_by(self, simulator: BatchSimulator) -> Self:
-        """The same objective by other simulations; counts go on together."""
-        return self._with(simulator=simulator)
+        """The same objective by other simulations, slopes too; counts go on together."""
+        return self._with(simulator=simulator, slopes_by=None, exact_slopes=False)
 
     def evaluate(self, chromosomes: FloatArray) -> tuple[FloatArray, BatchResult]:
         """Error of each chromosome, (n,), infinite where its simulation failed; and the batch."""

@@ -38,7 +38,12 @@ from sysid.fitting.refinement import MOST_ITERATIONS, refine
 from sysid.gassi.likelihood import fit_likelihood
 from sysid.uncertainty import profile, uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, score_covariance
-from sysid.uncertainty.ties import Ties
+from sysid.uncertainty.covariance import covariance
+from sysid.uncertainty.estimate import Z95
+from sysid.uncertainty.profile import Fit, Tracer
+from sysid.uncertainty.quantities import Coordinate
+from sysid.uncertainty.sensitivity import sensitivity
+from sysid.uncertainty.ties import Ties, ties
 from tests.sysid.support import Formula, lag, linear_response, prbs
 
 Z = 1.959963984540054
@@ -704,6 +709,31 @@ def test_errors_of_the_integration_steps_are_no_loss_of_likelihood(share):
     ends = profile(objective, np.array([2.0]), "gain")
     expected = 2.0 + Z * deviation * np.array([-1, 1])
     np.testing.assert_allclose((ends.low, ends.high), expected, rtol=1e-3)
+
+
+def test_a_worse_branch_of_a_valley_beyond_the_level_is_forgotten():
+    """From within there is a better fit at its place: where the level is, is sought anew."""
+    target = LINEAR.objective()
+    local = sensitivity(target, least_squares(target.records)[1])
+    spread = covariance(local, ties(local).directions)
+    tracer = Tracer(local, spread, np.eye(3)[0], Coordinate(target.space, 0))
+
+    def fit(place, statistic, **how):
+        return Fit(place, statistic, tracer.start, 0.0, **how)
+
+    search = tracer.bound(1.0)
+    far = next(search)
+    assert len(far.groups) == 1
+    between = search.send(fit(far.place, 50.0))
+    assert len(between.groups) == 2
+    assert tracer.centre < between.place < far.place
+    beyond = search.send(fit(between.place, 0.5, alone=True))
+    assert len(beyond.groups) == 1
+    reach = between.place - tracer.centre
+    assert beyond.place == pytest.approx(tracer.centre + 1.5 * reach)
+    with pytest.raises(StopIteration) as end:
+        search.send(fit(beyond.place, 1.001 * Z95**2))
+    assert end.value.value == pytest.approx(tracer.quantity.value(beyond.place), rel=1e-3)
 
 
 def test_few_steps_lead_along_a_narrow_valley_that_bends():
