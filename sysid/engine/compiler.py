@@ -132,10 +132,11 @@ def tangents(model: ProcessModel) -> Tangents:
     return Tangents(kernel, *_compiled(model, text, {}, ("simulate",)))
 
 
+@_once
 def is_differentiable(model: ProcessModel) -> bool:
-    """Whether a model has ``tangents``."""
+    """Whether a model has ``tangents``; nothing is compiled."""
     try:
-        tangents(model)
+        TangentKernel(model)
     except ModelError:
         return False
     return True

@@ -303,7 +303,7 @@ class BatchSimulator:
         records: Sequence[Dataset],
         directions: FloatArray,
         n_steps: IntArray,
-        starts: Sequence[FloatArray] | None = None,
+        starts: Sequence[FloatArray | None] | None = None,
         start_directions: Sequence[FloatArray] | None = None,
         scales: Sequence[FloatArray] | None = None,
     ) -> list[FloatArray]:

@@ -124,6 +124,14 @@ class Descent:
     shift: Shift | None = None
 
     @property
+    def is_corrected(self) -> bool:
+        """Whether its shift was taken where its steps were chosen, and is that of these steps."""
+        shift, at = self.shift, self.steps_at
+        if shift is None or at is None:
+            return False
+        return shift.coarse == self.steps and np.array_equal(shift.at, at)
+
+    @property
     def floor(self) -> float:
         """The floor below which outputs' errors are smoothed."""
         return FLOORS[self.smoothing] * self.point.error
@@ -214,10 +222,10 @@ def resolve(objective: Objective, descent: Descent) -> Descent | None:
 
 def correct(objective: Objective, descent: Descent) -> Descent | None:
     """The coarse simulations corrected anew, where they were some way back."""
-    shift, width = descent.shift, objective.space.width
-    if shift is None or np.all(np.abs(descent.point.at - shift.at) <= _NEAR * width):
+    at, shift = descent.point.at, descent.shift
+    if shift is None or np.all(np.abs(at - shift.at) <= _NEAR * objective.space.width):
         return None
-    return replace(descent, shift=None, failures=0)
+    return replace(descent, steps_at=at, failures=0)
 
 
 def refocus(_: Objective, descent: Descent) -> Descent | None:

@@ -35,7 +35,7 @@ orthogonal factors of the J_j, weighed and one above the other, it is H = R'R.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -99,11 +99,6 @@ class Quadratic:
     def hessian(self) -> FloatArray:
         """H, (n_free, n_free)."""
         return self.root.T @ self.root
-
-    @property
-    def gradient(self) -> FloatArray:
-        """g, (n_free,)."""
-        return self.root.T @ self.right
 
     @property
     def leads_somewhere(self) -> bool:
@@ -251,19 +246,18 @@ def bent(
     offer = replace(offer, coordinates=offer.coordinates[chosen], damping=offer.damping[chosen])
     space, (lower, upper) = objective.space, bounds
     steps = (offer.coordinates - at) / space.width
-    pushes = np.zeros(offer.coordinates.shape)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for j in np.flatnonzero(objective.weights > 0.0):
-            slopes = around.slopes[:, j]
-            surplus = ends.values[:, j, chosen].T - around.residual[:, j] - steps @ slopes.T
-            pushes += quadratic.factors[j] * (surplus @ slopes)
+
+    def surplus(j: int) -> FloatArray:
+        foretold = around.residual[:, j] + steps @ around.slopes[:, j].T
+        return ends.values[:, j, chosen].T - foretold
+
     diagonal = np.sum(quadratic.root**2, axis=0)
     scale = np.maximum(diagonal, 1e-12 * diagonal.max())
     added = np.sqrt(_FACTORS[-1]) * offer.damping[:, None] * scale
     if offer.undamped:
         added[-1] = quadratic.floor * scale
     free = (offer.coordinates > lower) & (offer.coordinates < upper)
-    moves = _led(quadratic.root, added, free, pushes)
+    moves = _led(quadratic, added, free, around.slopes, surplus)
     coordinates, damping = offer.coordinates + moves * space.width, offer.damping
     if offer.undamped:
         t = _LENGTHS[:, None] / _PART
@@ -290,20 +284,29 @@ def restored(
     hardly turn within a step, and mu keeps b from going along the valley.
     """
     space, (lower, upper) = objective.space, bounds
-    pushes = np.zeros(offer.coordinates.shape)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for j in np.flatnonzero(objective.weights > 0.0):
-            pushes += quadratic.factors[j] * (ends.values[:, j].T @ around.slopes[:, j])
     free = (offer.coordinates > lower) & (offer.coordinates < upper)
     mu = _RESTORING * np.sum(quadratic.root**2, axis=0).max() * np.ones(free.shape)
-    moves = _led(quadratic.root, mu, free, pushes)
+    moves = _led(quadratic, mu, free, around.slopes, lambda j: ends.values[:, j].T)
     coordinates = np.clip(offer.coordinates + moves * space.width, lower, upper)
     return _kept(offer, space, coordinates, offer.damping)
 
 
-def _led(root: FloatArray, added: FloatArray, free: BoolArray, pushes: FloatArray) -> FloatArray:
-    """Steps b of free coordinates with (R'R + added) b = -pushes, (n, n_free) each."""
-    triangles = _triangles(root[None], added, ~free)
+def _led(
+    quadratic: Quadratic,
+    added: FloatArray,
+    free: BoolArray,
+    slopes: FloatArray,
+    errors: Callable[[int], FloatArray],
+) -> FloatArray:
+    """Steps b of free coordinates with (H + added) b = -sum_j c_j J_j' e_j, (n, n_free) each.
+
+    errors: (n, n_residuals), e of an output by its place.
+    """
+    pushes = np.zeros(free.shape)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for j in np.flatnonzero(quadratic.factors > 0.0).tolist():
+            pushes += quadratic.factors[j] * (errors(j) @ slopes[:, j])
+    triangles = _triangles(quadratic.root[None], added, ~free)
     halves = _solved(np.swapaxes(triangles, 1, 2), np.where(free, -pushes, 0.0))
     return _solved(triangles, halves)
 

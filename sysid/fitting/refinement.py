@@ -11,9 +11,11 @@ An iteration of a descent at x, in search coordinates, takes two or three batche
     3. Where none gains half of what the quadratic promises, the same bent with the valley.
 
 Integration steps are chosen for x, are the same for all that is simulated around it, so that
-differences are those of the parameters alone, and are chosen anew when x has moved far. A descent
-has arrived when the quadratic promises no more than a tolerance, or no more is gained; what it
-does then, and where it stalls otherwise, are the ``STRATEGIES`` of ``descent``.
+differences are those of the parameters alone, and are chosen anew when x has moved far. Where an
+objective has coarser ones for descents, residuals are corrected by what they err at x then.
+
+A descent has arrived when the quadratic promises no more than a tolerance, or no more is gained;
+what it does then, and where it stalls otherwise, are the ``STRATEGIES`` of ``descent``.
 
 The method is Levenberg's ("A method for the solution of certain non-linear problems in least
 squares", Quarterly of Applied Mathematics 2, 1944) as scaled by Marquardt (1963). A descent's
@@ -278,8 +280,8 @@ def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Res
         error = float(objective.error_of(ends.rms[best : best + 1])[0])
         point = Point(at, error, ends.rms[best], float(ends.excess[best]))
         far = np.any(np.abs(at - descent.steps_at) > _FAR * objective.space.width)
-        steps_at, shift = (None, None) if far else (descent.steps_at, descent.shift)
-        descent = replace(descent, point=point, steps_at=steps_at, shift=shift, gain=gain)
+        steps_at = None if far else descent.steps_at
+        descent = replace(descent, point=point, steps_at=steps_at, gain=gain)
     promising, behind = offer.promise > NOTHING, gain < _KEPT * offer.promise
     little = gain <= descent.tolerance
     # By less damping more may be gained at once: where a valley bends it is seen only then.
@@ -307,13 +309,8 @@ def _ready(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents with what their simulations go by, steps and what corrects them."""
     coarse = objective.coarse
     descents = list(_with_steps(coarse, descents))
-    lacking = {
-        i: descent
-        for i, descent in enumerate(descents)
-        if coarse is not objective
-        and (descent.shift is None or descent.shift.coarse != descent.steps)
-    }
-    if not lacking:
+    lacking = {i: descent for i, descent in enumerate(descents) if not descent.is_corrected}
+    if coarse is objective or not lacking:
         return descents
     at = np.stack([descent.point.at for descent in lacking.values()])
     chromosomes = objective.space.decode(at)

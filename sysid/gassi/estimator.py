@@ -527,17 +527,14 @@ class GASSI(RecordEstimator):
 
     def _at_final_accuracy(self, objective: Objective) -> Objective:
         """The objective, simulated as accurately as at the end of ``fit``."""
-        if self._exact_slopes:
-            objective = objective.with_exact_slopes()
-        accuracy, given = self._final_accuracy, objective
-        if accuracy < self.accuracy:
-            objective = objective.finer(accuracy)
-        if accuracy == self._slopes_accuracy:
-            return objective
-        slopes_by = given.simulator
-        if self._slopes_accuracy < self.accuracy:
-            slopes_by = slopes_by.finer(self._slopes_accuracy)
-        return objective.with_slopes_by(slopes_by)
+
+        def by(accuracy: float) -> Objective:
+            return objective.finer(accuracy) if accuracy < self.accuracy else objective
+
+        final = by(self._final_accuracy)
+        if self._slopes_accuracy != self._final_accuracy:
+            final = final.with_slopes_by(by(self._slopes_accuracy).simulator)
+        return final.with_exact_slopes() if self._exact_slopes else final
 
     def _step(self, dt: float | None) -> float:
         if self.dt is None:

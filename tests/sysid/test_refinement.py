@@ -523,6 +523,21 @@ def test_a_descent_by_coarse_simulations_ends_where_exact_ones_would(without):
     assert abs(once.chromosome[0] / exact - 1.0) > 5e-4
 
 
+class InTwoSteps(Formula):
+    def steps_of_each(self, vectors, record):
+        return np.full(len(vectors), 2)
+
+
+def test_a_descent_that_is_cut_short_tells_the_steps_that_its_error_is_by():
+    target, rough = (
+        gain_objective(kind, lambda p, u: p["gain"] * u, 2.0 * SINE[:, None] + 0.01)
+        for kind in (InTwoSteps, Formula)
+    )
+    cut = refine(target.with_slopes_by(rough.simulator), np.array([1.0]), max_iterations=1)
+    assert cut.chromosome[0] > 1.5
+    assert cut.steps == (2,)
+
+
 HERE = Point(np.array([math.log(1.8)]), 0.1, np.array([0.1]))
 
 
