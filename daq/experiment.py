@@ -8,7 +8,7 @@ import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field, PrivateAttr
@@ -103,13 +103,31 @@ class FreeSetting:
 
 
 @dataclass(frozen=True)
+class Shaft:
+    """What a velocity loop may do with a rig's shaft.
+
+    speed: the rig's limit [rad/s]. endless: whether it may turn without end. torque_sensor: where
+    torque is measured. torque_constant: roughly the motor's [N*m/A], None where nothing tells it.
+    """
+
+    speed: float
+    endless: bool
+    torque_sensor: Literal["between", "load"]
+    torque_constant: float | None
+
+
+@dataclass(frozen=True)
 class RunFrame:
-    """What runs of a design have in common: their length, rate and ranges of the commands [V]."""
+    """What runs of a design have in common: their length, rate and ranges of the commands [V].
+
+    shaft: None where no loop may drive it.
+    """
 
     n_samples: int
     sample_rate: float
     motor: tuple[float, float]
     brake: tuple[float, float]
+    shaft: Shaft | None = None
 
     @property
     def seconds(self) -> float:
@@ -172,6 +190,11 @@ class Experiment(Section, abc.ABC):
     # Where its file lies, for the names of other files in it.
     _folder: Path = PrivateAttr(default=Path())
 
+    @classmethod
+    def family(cls, frame: RunFrame) -> Family | None:
+        """Runs within a frame that ``rig design`` may choose from; None: it chooses no such."""
+        return None
+
     @abc.abstractmethod
     def plan(self) -> Plan:
         """What the run will do.
@@ -225,11 +248,6 @@ class OpenLoop(Experiment):
     def remarks(self) -> tuple[str, ...]:
         """What else a user should know beforehand, a line each."""
         return ()
-
-    @classmethod
-    def family(cls, frame: RunFrame) -> Family | None:
-        """Runs within a frame that ``rig design`` may choose from; None: it chooses no such."""
-        return None
 
     def plan(self) -> Plan:
         """The commands and their peaks."""

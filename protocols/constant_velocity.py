@@ -2,21 +2,25 @@
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from daq.config.units import RadiansPerSecond, Seconds, Turns, Unit, Volts
-from daq.experiment import Controller, Plan
+from daq.experiment import Controller, Family, FreeSetting, Plan, RunFrame
 from daq.findings import Findings
 from daq.hal import FloatArray, Samples
 from protocols.analysis.plateau_findings import PlateauFindings
 from protocols.analysis.torque_curve import Motor, levels_of
-from protocols.control.loop import VelocityLoop, command_bounds
+from protocols.control.loop import BRAKE_SLOPE, VelocityLoop, command_bounds
 from protocols.control.staircase import Plateau, SettlingTest, Staircase, longest, quickest
 
 _OVERSPEED = 1.5  # of the fastest velocity asked for: beyond it something is wrong
 _SPEED_MARGIN = 10.0  # rad/s, the same for slow velocities
+# Of a design: number of velocities, the slowest [rad/s], the fastest in parts of the rig's limit,
+# shares of a run for the ramps, the brake's ramp at most, and settling at each velocity.
+_VELOCITIES, _SLOWEST, _FASTEST, _RAMPS, _BRAKING, _SETTLING = 3, 0.5, 0.6, (0.03, 0.5), 0.3, 0.05
 
 
 class ConstantVelocity(VelocityLoop):
@@ -51,6 +55,42 @@ class ConstantVelocity(VelocityLoop):
         le=1e4,
         description="speed from which plateaus count for c0 and c1; slower ones are only shown",
     )
+
+    @classmethod
+    def family(cls, frame: RunFrame) -> Family | None:
+        """Some velocities at a brake command, with any ramps and gains, on a shaft that is free."""
+        shaft = cls.driven_shaft(frame)
+        if shaft is None or not shaft.endless:
+            return None
+        fastest, time = _FASTEST * shaft.speed, frame.seconds - 2.0 / frame.sample_rate
+        strongest = min(frame.brake[1], _BRAKING * time * BRAKE_SLOPE)
+        free = {
+            **{
+                f"velocity_{k}": FreeSetting(-fastest, fastest, calm=0.0)
+                for k in range(_VELOCITIES)
+            },
+            "brake": FreeSetting(0.0, strongest, calm=0.0),
+            "ramps": FreeSetting(*_RAMPS),
+            **cls.loop_settings(frame),
+        }
+
+        def content(values: Mapping[str, float]) -> dict[str, Any]:
+            drawn = [values[f"velocity_{k}"] for k in range(_VELOCITIES)]
+            velocities = [math.copysign(max(abs(v), _SLOWEST), v) for v in drawn]
+            ways = np.abs(np.diff([0.0, *velocities, 0.0])).sum()
+            ramps, settling = values["ramps"] * time, _SETTLING * time
+            held = time - ramps - values["brake"] / BRAKE_SLOPE - (_VELOCITIES + 1) * settling
+            return {
+                **cls.loop_keys(values, frame, shaft),
+                "velocities": velocities,
+                "brake_commands": [values["brake"]],
+                "slope": float(ways) / ramps,
+                "measure": held / _VELOCITIES,
+                "turns": 0.0,
+                "settling": {"time": 0.0, "timeout": settling},
+            }
+
+        return Family(free, content)
 
     @property
     def plateaus(self) -> tuple[Plateau, ...]:

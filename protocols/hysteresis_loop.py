@@ -4,22 +4,24 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from daq.config.units import RadiansPerSecond, Seconds, Volts
-from daq.experiment import Answer, Controller, Plan, Sample
+from daq.experiment import Answer, Controller, Family, FreeSetting, Plan, RunFrame, Sample
 from daq.findings import Findings
 from daq.hal import FloatArray, Samples
 from protocols.analysis.hysteresis import Cycles, loop_findings
-from protocols.control.loop import VelocityLoop, VelocityServo, command_bounds
+from protocols.control.loop import BRAKE_SLOPE, VelocityLoop, VelocityServo, command_bounds
 from protocols.waveforms import whole_samples
 
 _REST = 0.5  # s before and after the cycles of a level
-_BRAKE_SLOPE = 0.5  # V/s
 _OVERSPEED, _SPEED_MARGIN = 2.0, 10.0  # of the amplitude, and rad/s, beyond which a run is ended
+# Of a design: share of a run for the brake's ramps at most, the least time for cycles [s] and how
+# many there are, the amplitude [rad/s] and in parts of the rig's limit.
+_BRAKING, _SWINGING, _CYCLES, _SLOWEST, _FASTEST = 0.4, 0.25, (3, 12), 0.5, 0.4
 _THERE = 0.95  # of the samples of a cycle that must have arrived for it to count
 
 
@@ -44,6 +46,34 @@ class HysteresisLoop(VelocityLoop):
     cycles: int = Field(
         6, ge=3, le=1000, description="at each brake command; the first is not counted"
     )
+
+    @classmethod
+    def family(cls, frame: RunFrame) -> Family | None:
+        """Any swing at a brake command, with any gains of the loop."""
+        shaft, time = cls.driven_shaft(frame), frame.seconds - 2.0 * _REST
+        strongest = min(frame.brake[1], 0.5 * _BRAKING * time * BRAKE_SLOPE)
+        if shaft is None or (1.0 - _BRAKING) * time < _SWINGING:
+            return None
+        free = {
+            "amplitude": FreeSetting(_SLOWEST, _FASTEST * shaft.speed, log=True),
+            "cycles": FreeSetting(*_CYCLES, whole=True),
+            "brake": FreeSetting(0.0, strongest, calm=0.0),
+            **cls.loop_settings(frame),
+        }
+
+        def content(values: Mapping[str, float]) -> dict[str, Any]:
+            cycles, swinging = int(values["cycles"]), time - 2.0 * values["brake"] / BRAKE_SLOPE
+            # Ramps and rests are rounded to samples, too.
+            period = math.floor((swinging * frame.sample_rate - 2.0) / cycles) / frame.sample_rate
+            return {
+                **cls.loop_keys(values, frame, shaft),
+                "brake_commands": [values["brake"]],
+                "amplitude": values["amplitude"],
+                "period": period,
+                "cycles": cycles,
+            }
+
+        return Family(free, content)
 
     def plan(self) -> Plan:
         """How long it takes, what the shaft is asked for, and how far it turns."""
@@ -99,7 +129,7 @@ class HysteresisLoop(VelocityLoop):
 
     def _rest(self, before: float, brake: float) -> FloatArray:
         """The shaft at rest while the brake goes from one command to another, (4, n)."""
-        ramp = round(abs(brake - before) / _BRAKE_SLOPE * self.sample_rate)
+        ramp = round(abs(brake - before) / BRAKE_SLOPE * self.sample_rate)
         rest = round(_REST * self.sample_rate)
         rising = np.linspace(before, brake, ramp, endpoint=False)
         commands = np.concatenate([rising, np.full(rest, brake)])

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         Design,
         Discrimination,
         Excitation,
+        Feedback,
         Prior,
         Setting,
         design,
@@ -64,6 +65,7 @@ __all__ = [
     "Discrimination",
     "EarlierMinima",
     "Excitation",
+    "Feedback",
     "Given",
     "Guess",
     "Identifiability",
@@ -115,7 +117,7 @@ _NAMES = {
     "sysid.engine.simulation": "BatchResult BatchSimulator Status",
     "sysid.engine.stepper": "Stepper",
     "sysid.experiments": (
-        "Contest Design Discrimination Excitation Prior Setting design discriminate"
+        "Contest Design Discrimination Excitation Feedback Prior Setting design discriminate"
     ),
     "sysid.fitting.free_run": "free_run",
     "sysid.gassi": "GASSI",

@@ -140,7 +140,7 @@ def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:
         [
             run.file.name,
             run.protocol,
-            *(_span(run.commands[:, j].min(), run.commands[:, j].max()) for j in range(2)),
+            *(_span(volts.min(), volts.max()) for volts in run.commands),
         ]
         for run in runs
     ]

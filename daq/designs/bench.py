@@ -7,6 +7,7 @@ from threading import Lock
 import numpy as np
 
 from daq.config.rig import RigConfig
+from daq.designs.closed_loop import COMMANDS, MEASURED, ClosedLoopRun, play
 from daq.designs.knowledge import expected_jitter, speed_noise
 from daq.errors import ConfigError
 from daq.experiment import Plan
@@ -16,10 +17,9 @@ from daq.limits.base import TURN
 from daq.limits.encoder import Acceleration
 from daq.logs.encoder import SPEED
 from daq.run.plan import check_commands
-from sysid import BatchSimulator, Dataset, ProcessModel
+from sysid import BatchSimulator, Dataset, Feedback, ProcessModel
 
-COMMANDS = tuple(f"applied_voltage_{name}" for name in CHANNELS)
-MEASURED = ("current_motor", "current_brake", "torque", "theta", "omega")
+COMMANDED = tuple(f"cmd_voltage_{name}" for name in CHANNELS)
 _STEP, _HOLD, _STEPS = 0.2, 0.05, 4  # of the commands: in parts of their ranges, s, number
 _WELL = 0.8  # of the draws, whose integration is to be as exact as that
 _FOLLOWED, _MINORITY = 5, 0.5  # draws that are compared, and their share that may go astray
@@ -84,18 +84,43 @@ class PlantBench:
         shared = [name for name in model.parameter_names if name in plant.parameter_names]
         self._from = [model.parameter_names.index(name) for name in shared]
         self._to = [plant.parameter_names.index(name) for name in shared]
+        self._commanded = [plant.input_names.index(name) for name in COMMANDS]
         self._choosing = Lock()
         self._steps_of: dict[bytes, IntArray] = {}
 
     def records(
-        self, inputs: FloatArray, dt: float, vectors: FloatArray
+        self, inputs: FloatArray | Feedback, dt: float, vectors: FloatArray
     ) -> Sequence[Dataset] | None:
         """As of ``sysid.experiments.bench.Bench``; inputs: commands (n_samples, 2) [V].
 
-        Refused is what passes a limit with any vector, and what leads the model astray with the
-        likeliest or with more than half of those that are compared, or any that is known to be
-        plausible.
+        Of a feedback, commands that answer what is ``MEASURED``. Refused is what passes a limit
+        with any vector, and what leads the model astray with the likeliest or with more than half
+        of those that are compared, or any that is known to be plausible.
         """
+        if isinstance(inputs, Feedback):
+            return self._closed_loops(inputs, dt, vectors)
+        return self._open_loops(inputs, dt, vectors)
+
+    def signals(
+        self, inputs: FloatArray | Feedback, dt: float, vectors: FloatArray
+    ) -> dict[str, FloatArray]:
+        """What would be commanded and the rig's sensors see, by name, each (n, n_samples).
+
+        vectors: (n, n_parameters), of the model's parameters. A controller that ends its run leaves
+        the commands at zero.
+        """
+        if isinstance(inputs, Feedback):
+            each = [self._played(inputs, dt, vector) for vector in vectors]
+            return {name: np.concatenate([of_it[name] for of_it in each]) for name in each[0]}
+        steps, _ = self._finer(inputs, dt, vectors)
+        rows = (len(vectors), len(inputs))
+        commanded = {name: np.broadcast_to(inputs[:, j], rows) for j, name in enumerate(COMMANDED)}
+        return {**commanded, **self._run(inputs, dt, vectors, int(steps.max()))}
+
+    def _open_loops(
+        self, inputs: FloatArray, dt: float, vectors: FloatArray
+    ) -> Sequence[Dataset] | None:
+        """As ``records``: all vectors are driven by the same commands."""
         if not self._commands_allowed(inputs, dt):
             return None
         # What refuses most is computed first.
@@ -119,13 +144,45 @@ class PlantBench:
                 signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values
         return [self._record(inputs, dt, signals, k) for k in range(len(vectors))]
 
-    def signals(self, inputs: FloatArray, dt: float, vectors: FloatArray) -> dict[str, FloatArray]:
-        """What the rig's sensors would see, by name, each (n, n_samples).
+    def _closed_loops(
+        self, feedback: Feedback, dt: float, vectors: FloatArray
+    ) -> Sequence[Dataset] | None:
+        """As ``records``: each vector has the commands that answer it."""
+        records, may = [], 0 if self._identified else int(_MINORITY * _FOLLOWED)
+        for k, vector in enumerate(vectors):
+            run = self._play(feedback, dt, vector)
+            if run is None or not self._allowed(run, dt):
+                return None
+            if k == 0 and not self._tells_speed(run.signals["omega"][0]):
+                self.turning += 1
+                return None
+            if k < _FOLLOWED and self._strays(run.commands, dt, vector):
+                may -= 1
+                if k == 0 or may < 0:
+                    self.strays += 1
+                    return None
+            records.append(self._record(run.commands, dt, run.signals, 0))
+        return records
 
-        vectors: (n, n_parameters), of the model's parameters.
-        """
-        steps, _ = self._finer(inputs, dt, vectors)
-        return self._run(inputs, dt, vectors, int(steps.max()))
+    def _play(self, feedback: Feedback, dt: float, vector: FloatArray) -> ClosedLoopRun | None:
+        plant, count = self._simulator.model, abs(self._rig.sensors.encoder.count)
+        return play(feedback, plant, self._of_plant(vector[None])[0], dt, count)
+
+    def _allowed(self, run: ClosedLoopRun, dt: float) -> bool:
+        within = self._commands_allowed(run.commands, dt)
+        return within and self._within_limits(run.commands, dt, run.signals)
+
+    def _strays(self, commands: FloatArray, dt: float, vector: FloatArray) -> bool:
+        """Whether the plant does what the model does not with a vector, by its own commands."""
+        steps, larger = self._finer(commands, dt, vector[None])
+        return self._leads_astray(commands, dt, vector, larger, int(steps[0]))
+
+    def _played(self, feedback: Feedback, dt: float, vector: FloatArray) -> dict[str, FloatArray]:
+        """As ``signals`` of a vector, as long as the longest run; nothing where it is stopped."""
+        run, commands = self._play(feedback, dt, vector), np.zeros((feedback.n_samples, 2))
+        if run is not None:
+            commands[: len(run.commands)] = run.commands
+        return self.signals(commands, dt, vector[None])
 
     def _run(
         self, inputs: FloatArray, dt: float, vectors: FloatArray, n_steps: int
@@ -150,7 +207,7 @@ class PlantBench:
         """A run of the plant, of which nothing was measured."""
         plant = self._simulator.model
         driven = np.zeros((len(inputs), len(plant.inputs)))
-        driven[:, [plant.input_names.index(name) for name in COMMANDS]] = inputs
+        driven[:, self._commanded] = inputs
         return Dataset(driven, np.full((len(inputs), len(plant.outputs)), np.nan), dt)
 
     def _steps(self, dt: float, vectors: FloatArray) -> IntArray:

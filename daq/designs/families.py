@@ -8,13 +8,14 @@ from typing import Any
 
 from daq.config.question import Question
 from daq.config.yaml_file import YamlFile
+from daq.designs.closed_loop import feedback_of
 from daq.errors import ConfigError
-from daq.experiment import Family, OpenLoop, RunFrame
+from daq.experiment import ClosedLoop, Experiment, Family, RunFrame
 from daq.hal import FloatArray
 from daq.lookup.classes import find_class
 from daq.plugins import installed
 from daq.run.protocol import plan_of
-from sysid import Excitation, Setting
+from sysid import Excitation, Feedback, Setting
 
 _DIGITS = 4  # of a setting that a design chooses
 _ROUNDING = 12  # digits of what follows from it: times stay whole numbers of samples
@@ -24,7 +25,7 @@ _ROUNDING = 12  # digits of what follows from it: times stay whole numbers of sa
 class ProtocolFamily:
     """A protocol's family, and the keys that all its experiments have in common."""
 
-    protocol: type[OpenLoop]
+    protocol: type[Experiment]
     family: Family
     common: Mapping[str, Any]
 
@@ -37,9 +38,12 @@ class ProtocolFamily:
         content: dict[str, Any] = {**self.common, **_rounded(self.family.content(short))}
         return content
 
-    def commands(self, settings: Mapping[str, float]) -> FloatArray:
-        """The commands of the run, (n_samples, 2) [V]."""
-        planned = plan_of(self.protocol.model_validate(self.content(settings)))
+    def commands(self, settings: Mapping[str, float]) -> FloatArray | Feedback:
+        """The commands of the run, (n_samples, 2) [V], or what makes them of the samples."""
+        experiment = self.protocol.model_validate(self.content(settings))
+        planned = plan_of(experiment)
+        if isinstance(experiment, ClosedLoop):
+            return feedback_of(experiment, planned)
         assert planned.commands is not None
         return planned.commands
 
@@ -65,7 +69,7 @@ def families_of(
             if question.protocols:
                 raise ConfigError.of(file.blamed(("protocols", k), error)) from None
             continue
-        family = protocol.family(frame) if issubclass(protocol, OpenLoop) else None
+        family = protocol.family(frame)
         if family is not None:
             common = {
                 "protocol": name,
@@ -88,7 +92,7 @@ def with_family(frame: RunFrame) -> Sequence[str]:
     for name in installed("protocol"):
         with contextlib.suppress(ConfigError):  # one that does not load
             protocol = find_class("protocol", name, Path())
-            if issubclass(protocol, OpenLoop) and protocol.family(frame) is not None:
+            if protocol.family(frame) is not None:
                 names.append(name)
     return names
 

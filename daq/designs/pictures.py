@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.rig import RigConfig
+from daq.designs.bench import COMMANDED
 from daq.designs.result import DesignResult, PlannedRun
 from daq.figures import design as figures
 from daq.figures import style
@@ -36,19 +37,17 @@ def draw_runs(
     intervals: half widths before and after, and what is wanted, by quantity [%]. Raises RunError
     where the disk refuses.
     """
-    commands = np.concatenate([run.commands for run in runs])
-    ends = np.cumsum([len(run.commands) * run.dt for run in runs])
-    time: FloatArray = np.arange(len(commands), dtype=np.float64) * runs[0].dt
-    predictions = []
-    for j, name in enumerate(CHANNELS):
-        line = commands[:, j]
-        limits = getattr(rig.limits.command, name)
-        title = f"cmd_voltage_{name}"
-        predictions.append(Prediction(title, "V", line, line, line, limits, steps=True))
-    for name, limits in _limits_of(rig).items():
-        if name in runs[0].signals:
-            values = np.concatenate([run.signals[name] for run in runs], axis=1)
-            predictions.append(_prediction(name, values, limits))
+    signals = {
+        name: np.concatenate([run.signals[name] for run in runs], axis=1)
+        for name in runs[0].signals
+    }
+    ends = np.cumsum([run.seconds for run in runs])
+    time: FloatArray = np.arange(len(signals["omega"][0]), dtype=np.float64) * runs[0].dt
+    predictions = [
+        _prediction(name, signals[name], limits)
+        for name, limits in _limits_of(rig).items()
+        if name in signals
+    ]
     figure = figures.design(time, ends[:-1].tolist(), predictions, intervals)
     write_whole(path, style.render(figure, style.format_of(path)))
 
@@ -63,8 +62,10 @@ def _limits_of(rig: RigConfig) -> dict[str, _Limits]:
         "omega": limits.speed,
     }
     ends: dict[str, _Limits] = {
-        name: (None if most is None else -most, most) for name, most in both.items()
+        name: getattr(limits.command, channel)
+        for name, channel in zip(COMMANDED, CHANNELS, strict=True)
     }
+    ends |= {name: (None if most is None else -most, most) for name, most in both.items()}
     low = limits.winding if limits.winding is not None else travel[0]
     ends["theta"] = _in_radians(low), _in_radians(travel[1])
     return ends
@@ -75,4 +76,6 @@ def _in_radians(turns: float | None) -> float | None:
 
 
 def _prediction(name: str, values: FloatArray, limits: _Limits) -> Prediction:
-    return Prediction(name, UNITS[name], values[0], values.min(axis=0), values.max(axis=0), limits)
+    lowest, highest = values.min(axis=0), values.max(axis=0)
+    steps = name in COMMANDED
+    return Prediction(name, UNITS[name], values[0], lowest, highest, limits, steps=steps)

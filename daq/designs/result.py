@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.config.question import Question
+from daq.designs.bench import COMMANDED
 from daq.hal import FloatArray
 from daq.views import Shown
 from sysid import Design, ProcessModel
@@ -27,16 +28,25 @@ class Unknown:
 class PlannedRun:
     """A run of a design: its file, its protocol and what it is expected to do.
 
-    commands: (n_samples, 2) [V]. signals: of the rig by name, (n_draws, n_samples) each, the first
-    row at the likeliest parameters. dt: sample time [s].
+    signals: of the rig by name, commands too, (n_draws, n_samples) each, the first row at the
+    likeliest parameters. dt: sample time [s].
     """
 
     file: Path
     protocol: str
     settings: Mapping[str, float]
-    commands: FloatArray
     signals: Mapping[str, FloatArray]
     dt: float
+
+    @property
+    def commands(self) -> tuple[FloatArray, ...]:
+        """Commands of motor and brake, (n_draws, n_samples) each [V]."""
+        return tuple(self.signals[name] for name in COMMANDED)
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes, at most [s]."""
+        return len(self.signals["omega"][0]) * self.dt
 
     @property
     def document(self) -> dict[str, Any]:
@@ -44,7 +54,7 @@ class PlannedRun:
         return {
             "file": str(self.file),
             "protocol": self.protocol,
-            "seconds": len(self.commands) * self.dt,
+            "seconds": self.seconds,
             "settings": dict(self.settings),
         }
 

@@ -46,7 +46,7 @@ def write_runs(
         ]
         names = [name for name in each[0] if all(name in signals for signals in each)]
         signals = {name: np.concatenate([s[name] for s in each]) for name in names}
-        runs.append(PlannedRun(path, run.excitation, run.settings, run.inputs, signals, run.dt))
+        runs.append(PlannedRun(path, run.excitation, run.settings, signals, run.dt))
     return tuple(runs)
 
 

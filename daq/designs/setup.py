@@ -16,7 +16,7 @@ from daq.designs.bench import PlantBench
 from daq.designs.families import ProtocolFamily, families_of
 from daq.designs.knowledge import noise_of, prior_of, require_calibrated
 from daq.errors import ConfigError
-from daq.experiment import RunFrame
+from daq.experiment import RunFrame, Shaft
 from daq.hal import Device, Simulation
 from daq.identification import stages
 from daq.identification.request import SettingsRequest
@@ -119,7 +119,7 @@ def _set_up_each(
     turns = question.turns
     if turns is None:
         turns = _TURNS if rig.limits.winding is not None else 0.0
-    frame = _frame(file, question, rig)
+    frame = _frame(file, question, rig, _shaft(rig, problems[0].model, turns))
     families = families_of(file, question, frame, turns)
     log = _beside(file, "log", question.log)
     recording = None if log is None else load_recording(log_path(Path(log)))
@@ -167,7 +167,18 @@ def _beside(file: TypedSettings, key: str, name: str | None) -> str | None:
     return str(beside) if beside.exists() else name
 
 
-def _frame(file: YamlFile, question: Question, rig: RigConfig) -> RunFrame:
+def _shaft(rig: RigConfig, model: ProcessModel, turns: float) -> Shaft | None:
+    """What loops may do with a rig's shaft: nothing, where no speed is too fast."""
+    limits = rig.limits
+    if limits.speed is None:
+        return None
+    endless = turns == 0.0 and limits.winding is None and limits.travel is None
+    between = "torque" in model.output_names
+    constant = rig.sensors.torque.motor_constant
+    return Shaft(limits.speed, endless, "between" if between else "load", constant)
+
+
+def _frame(file: YamlFile, question: Question, rig: RigConfig, shaft: Shaft | None) -> RunFrame:
     n_samples = round(question.seconds * question.sample_rate)
     if n_samples < 2:
         problem = f"{question.seconds:g} s at {question.sample_rate:g} Hz makes {n_samples} samples"
@@ -176,7 +187,7 @@ def _frame(file: YamlFile, question: Question, rig: RigConfig) -> RunFrame:
         problem = f"a run of {question.seconds:g} s is longer than the {question.time:g} s of all"
         raise file.error(("run",), problem, "make it shorter, or give more time")
     ranges = rig.limits.command
-    return RunFrame(n_samples, question.sample_rate, ranges.motor, ranges.brake)
+    return RunFrame(n_samples, question.sample_rate, ranges.motor, ranges.brake, shaft)
 
 
 def _space(file: YamlFile, problem: Problem) -> SearchSpace:

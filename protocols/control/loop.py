@@ -1,9 +1,9 @@
 """Sampled loops: PID, slow references, the speed's estimate, bounds; and the velocity loop."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -11,13 +11,17 @@ from pydantic import Field
 from daq.config.base import Section
 from daq.config.units import Hertz, Seconds, Unit, Volts
 from daq.errors import RunError
-from daq.experiment import ClosedLoop, Sample
+from daq.experiment import ClosedLoop, FreeSetting, RunFrame, Sample, Shaft
 from daq.hal import FloatArray
 
 MotorLimit = Annotated[
     Volts, Field(gt=0.0, le=10.0, description="largest motor command, either way")
 ]
 MOTOR_LIMIT = 4.5  # V
+BRAKE_SLOPE = 0.5  # V/s; a brake let go at once would let the shaft leap
+# Of a design's loops: the largest command in parts of the motor's range; command at an error of the
+# fastest speed, in parts of the same; time in which the integral does as much again [s].
+_LARGEST, _STIFFNESS, _INTEGRAL_TIME = (0.1, 0.9), (0.5, 10.0), (0.02, 0.5)
 TrackerBandwidth = Annotated[Hertz, Field(gt=0.0, le=1e4)]
 TRACKER_BANDWIDTH = 150.0  # Hz
 
@@ -183,6 +187,44 @@ class VelocityLoop(ClosedLoop):
         description="between motor and brake, or at the load"
     )
     ratings: Ratings = Field(Ratings(), description="what data sheets say of motor and brake")
+
+    @staticmethod
+    def loop_settings(frame: RunFrame) -> dict[str, FreeSetting]:
+        """Settings of the loop that a design may choose."""
+        least, most = (share * min(-frame.motor[0], frame.motor[1]) for share in _LARGEST)
+        return {
+            "motor_limit": FreeSetting(least, most, calm=least),
+            "stiffness": FreeSetting(*_STIFFNESS, log=True),
+            "integral_time": FreeSetting(*_INTEGRAL_TIME, log=True),
+        }
+
+    @staticmethod
+    def loop_keys(values: Mapping[str, float], frame: RunFrame, shaft: Shaft) -> dict[str, Any]:
+        """Keys that all velocity loops have, at values of the free settings."""
+        reach = min(-frame.motor[0], frame.motor[1])
+        proportional = values["stiffness"] * reach / shaft.speed
+        ratings = (
+            {} if shaft.torque_constant is None else {"torque_constant": shaft.torque_constant}
+        )
+        return {
+            "loop": {
+                "proportional": proportional,
+                "integral": proportional / values["integral_time"],
+            },
+            "motor_limit": values["motor_limit"],
+            "torque_sensor": shaft.torque_sensor,
+            "ratings": ratings,
+        }
+
+    @staticmethod
+    def driven_shaft(frame: RunFrame) -> Shaft | None:
+        """The shaft that a design's loops may drive; None where they cannot, or tell no torque."""
+        shaft = frame.shaft
+        drives = frame.motor[0] < 0.0 < frame.motor[1] and frame.brake[1] > 0.0
+        if shaft is None or not drives:
+            return None
+        tells = shaft.torque_sensor == "between" or shaft.torque_constant is not None
+        return shaft if tells else None
 
     def servo(self, fastest: float, cure: str) -> VelocityServo:
         """The loop's servo for one run; fastest and cure as of ``VelocityServo``."""

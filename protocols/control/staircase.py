@@ -14,10 +14,9 @@ from daq.config.units import Percent, RadiansPerSecond, Seconds
 from daq.errors import RunError
 from daq.experiment import Answer, Sample
 from daq.hal import FloatArray
-from protocols.control.loop import Ramp, VelocityServo
+from protocols.control.loop import BRAKE_SLOPE, Ramp, VelocityServo
 
 _RUNAWAY = 10.0  # rad/s that a shaft may gain while the motor brakes with all its might
-_BRAKE_SLOPE = 0.5  # V/s; a brake let go at once would let the shaft leap
 
 
 class SettlingTest(Section):
@@ -75,7 +74,7 @@ class Staircase:
     ) -> None:
         self._plateaus, self._settling = plateaus, settling
         self._servo, self._limit = servo, limit
-        self._velocity_ramp, self._brake_ramp = Ramp(slope), Ramp(_BRAKE_SLOPE)
+        self._velocity_ramp, self._brake_ramp = Ramp(slope), Ramp(BRAKE_SLOPE)
         self._time, self._braked_from = 0.0, math.inf
         self._plateau, self._index = Plateau(0.0, 0.0, 0.0), -1
         self._next(0.0)
@@ -141,8 +140,9 @@ class Staircase:
 def longest(plateaus: Sequence[Plateau], settling: SettlingTest, slope: float) -> float:
     """The longest that a staircase can take [s]."""
     velocities = [0.0, *(plateau.velocity for plateau in plateaus), 0.0]
+    pulls = [0.0, *(plateau.brake for plateau in plateaus)]
     ramps = sum(abs(b - a) for a, b in itertools.pairwise(velocities)) / slope
-    brakes = sum(abs(b.brake - a.brake) for a, b in itertools.pairwise(plateaus)) / _BRAKE_SLOPE
+    brakes = sum(abs(b - a) for a, b in itertools.pairwise(pulls)) / BRAKE_SLOPE
     held = sum(plateau.measure + settling.timeout for plateau in plateaus)
     return ramps + brakes + held + settling.timeout
 
@@ -154,10 +154,10 @@ def quickest(
     velocities, brakes, before = [], [], Plateau(0.0, 0.0, 0.0)
     for plateau in (*plateaus, Plateau(0.0, plateaus[-1].brake, 0.0)):
         turn, pull = plateau.velocity - before.velocity, plateau.brake - before.brake
-        ramps = max(abs(turn) / slope, abs(pull) / _BRAKE_SLOPE)
+        ramps = max(abs(turn) / slope, abs(pull) / BRAKE_SLOPE)
         time = np.arange(1, round((ramps + settling.time + plateau.measure) * rate) + 1) / rate
         velocities.append(before.velocity + _ramp(turn, slope, time))
-        brakes.append(before.brake + _ramp(pull, _BRAKE_SLOPE, time))
+        brakes.append(before.brake + _ramp(pull, BRAKE_SLOPE, time))
         before = plateau
     return np.concatenate(velocities), np.concatenate(brakes)
 

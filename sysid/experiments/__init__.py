@@ -9,6 +9,7 @@ from sysid.experiments.experiment import (
     PredictedQuantity,
     design,
 )
+from sysid.experiments.feedback import Feedback
 from sysid.experiments.prior import Prior
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "DesignedRun",
     "Discrimination",
     "Excitation",
+    "Feedback",
     "PredictedQuantity",
     "Prior",
     "Setting",

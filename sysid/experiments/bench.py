@@ -7,6 +7,8 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.engine.simulation import BatchSimulator
+from sysid.engine.stepper import Stepper
+from sysid.experiments.feedback import Feedback
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 
@@ -15,13 +17,13 @@ class Bench(Protocol):
     """A rig, or what stands for it before anything is energised."""
 
     def records(
-        self, inputs: FloatArray, dt: float, vectors: FloatArray
+        self, inputs: FloatArray | Feedback, dt: float, vectors: FloatArray
     ) -> Sequence[Dataset] | None:
         """What a run would log if the parameters were each of ``vectors`` (n, n_parameters).
 
-        inputs: (n_samples, n), as an excitation gives them; dt: sample time [s]. None where a run
-        with any of the vectors would pass a limit. Of a record inputs, first samples and jitter
-        count. Several threads ask at once.
+        inputs: (n_samples, n), as an excitation gives them, or what makes them while it runs;
+        dt: sample time [s]. None where a run with any of the vectors would pass a limit. Of a
+        record inputs, first samples and jitter count. Several threads ask at once.
         """
 
 
@@ -58,9 +60,11 @@ class FreeRun:
                 raise ModelError(f"limits of {name}: low end {low:g} is not below {high:g}")
 
     def records(
-        self, inputs: FloatArray, dt: float, vectors: FloatArray
+        self, inputs: FloatArray | Feedback, dt: float, vectors: FloatArray
     ) -> Sequence[Dataset] | None:
-        """As of ``Bench``: every vector gives the same record."""
+        """As of ``Bench``: every vector gives the same record, but of a feedback."""
+        if isinstance(inputs, Feedback):
+            return self._closed_loops(inputs, dt, vectors)
         names = self._model.input_names
         if not all(self._within(inputs[:, j], name) for j, name in enumerate(names)):
             return None
@@ -73,6 +77,18 @@ class FreeRun:
             if not all(self._within(outputs[..., j], name) for j, name in signals):
                 return None
         return [record] * len(vectors)
+
+    def _closed_loops(
+        self, feedback: Feedback, dt: float, vectors: FloatArray
+    ) -> Sequence[Dataset] | None:
+        records: list[Dataset] = []
+        for vector in vectors:
+            inputs, _ = feedback.run(Stepper(self._model, vector, dt))
+            of_it = self.records(inputs, dt, vector[None])
+            if of_it is None:
+                return None
+            records += of_it
+        return records
 
     def _within(self, values: FloatArray, name: str) -> bool:
         low, high = (

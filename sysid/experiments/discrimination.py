@@ -9,12 +9,14 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.bench import Bench, FreeRun
 from sysid.experiments.excitation import Excitation
-from sysid.experiments.experiment import ChosenRuns, designed_run, deviations_of
+from sysid.experiments.experiment import FEW, ChosenRuns, designed_run, deviations_of
+from sysid.experiments.feedback import Feedback
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
 from sysid.experiments.rivals import Answer, Hypothesis
 from sysid.experiments.search import RunCandidate, Search
 from sysid.experiments.tournament import EVEN, AnsweredRun, Point, Tournament, power
+from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
 from sysid.threads import Workers, available_cores, one_thread
@@ -145,19 +147,32 @@ def discriminate(
     counted = np.array([name in noise for name in structures[0].simulator.model.output_names])
     tournament = Tournament(structures, counted, workers, rng)
 
-    def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
-        inputs, records = excitation.signal(genes), []
+    def logged(inputs: FloatArray | Feedback, dt: float, n: int) -> list[Dataset] | None:
+        records = []
         for structure, of_it in zip(structures, vectors, strict=True):
-            logged = benches[structure.name].records(inputs, excitation.dt, of_it)
-            if logged is None:
+            each = benches[structure.name].records(inputs, dt, of_it[:n])
+            if each is None:
                 return None
-            records.append(logged[0])
+            records.append(each[0])
+        return records
+
+    def confirm(candidate: RunCandidate) -> bool:
+        inputs = candidate.excitation.signal(candidate.genes)
+        feedback = isinstance(inputs, Feedback)
+        return not feedback or logged(inputs, candidate.excitation.dt, checks) is not None
+
+    def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
+        inputs = excitation.signal(genes)
+        records = logged(inputs, excitation.dt, FEW if isinstance(inputs, Feedback) else checks)
+        if records is None:
+            return None
         answers = tournament.answers(records)
         if not all(each.finite for each in answers):
             return None
         return tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
 
-    search = Search(excitations, evaluate, tournament.criterion(), rng, runs, workers, watch)
+    aim = tournament.criterion()
+    search = Search(excitations, evaluate, aim, rng, runs, workers, watch, confirm)
     search.scatter(candidates)
     begins = tournament.begins(tournament.likeliest(), starts)
     tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins)[0])
@@ -180,8 +195,8 @@ def discriminate(
     answers = _answers(best[1])
     begins = tournament.begins(best[2], starts)
     sharp = tournament.sharper(_SHARPER * accuracy)
-    logged = [sharp.answers([a.record for a in run]) for run in answers]
-    end = sharp.refit(logged, [tournament.refit(answers, begins)[0]])
+    sharper = [sharp.answers([a.record for a in run]) for run in answers]
+    end = sharp.refit(sharper, [tournament.refit(answers, begins)[0]])
     contests = _contests(sharp, tournament.possible, *end)
     runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
     return Discrimination(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import FloatArray
+from sysid.experiments.feedback import Feedback
 from sysid.problem.model import ModelError, check_range
 
 
@@ -50,7 +51,8 @@ class Excitation:
     """A family of runs: inputs as a function of free settings.
 
     inputs: of settings by name, (n_samples, n_inputs) in the order of the model's inputs (or
-    what else the ``Bench`` of a design takes). dt: sample time [s].
+    what else the ``Bench`` of a design takes), or what makes them of the outputs while it runs.
+    dt: sample time [s].
 
     >>> steps = Excitation(
     ...     "step", {"height": Setting(-1.0, 1.0)}, lambda s: np.full((50, 1), s["height"]), 0.01
@@ -61,7 +63,7 @@ class Excitation:
 
     name: str
     settings: Mapping[str, Setting]
-    inputs: Callable[[Mapping[str, float]], FloatArray]
+    inputs: Callable[[Mapping[str, float]], FloatArray | Feedback]
     dt: float
 
     def at(self, genes: FloatArray) -> dict[str, float]:
@@ -74,10 +76,13 @@ class Excitation:
         pairs = zip(self.settings.values(), genes.tolist(), strict=True)
         return np.array([setting.towards_calm(gene) for setting, gene in pairs])
 
-    def signal(self, genes: FloatArray) -> FloatArray:
-        """Inputs at places in the ranges of the settings, (n_samples, n_inputs)."""
+    def signal(self, genes: FloatArray) -> FloatArray | Feedback:
+        """Inputs at places in the ranges of the settings, (n_samples, n_inputs), or a feedback."""
         settings = self.at(genes)
-        signal = np.asarray(self.inputs(settings), dtype=np.float64)
+        inputs = self.inputs(settings)
+        if isinstance(inputs, Feedback):
+            return inputs
+        signal = np.asarray(inputs, dtype=np.float64)
         if signal.ndim != 2 or len(signal) < 2 or not np.isfinite(signal).all():
             raise ModelError(
                 f"excitation {self.name} at {settings}: its inputs have shape {signal.shape}; "

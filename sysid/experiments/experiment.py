@@ -10,6 +10,7 @@ from sysid.engine.simulation import BatchSimulator
 from sysid.experiments import criteria
 from sysid.experiments.bench import Bench, FreeRun
 from sysid.experiments.excitation import Excitation
+from sysid.experiments.feedback import Feedback
 from sysid.experiments.information import Informant, tells_nothing_there
 from sysid.experiments.prior import Prior
 from sysid.experiments.quantities import chosen, determined, relative_gradients
@@ -27,19 +28,26 @@ from sysid.uncertainty.ties import named_values
 # Runs are searched for by coarser simulations and few draws of the inputs' noise; of those chosen
 # it is told by what was asked for and by many. Times the accuracy, its end, draws.
 _COARSER, _COARSEST, _DRAWS = 10.0, 0.1, 96
+FEW = 4  # parameter vectors at least that a feedback is tried with, before it is chosen
 
 
 @dataclass(frozen=True)
 class DesignedRun:
     """A run of a design: the excitation's name, its settings, and the inputs that they make.
 
-    inputs: (n_samples, n_inputs). dt: sample time [s].
+    inputs: (n_samples, n_inputs), or what makes them while it runs. dt: sample time [s].
     """
 
     excitation: str
     settings: Mapping[str, float]
-    inputs: FloatArray
+    inputs: FloatArray | Feedback
     dt: float
+
+    @property
+    def n_samples(self) -> int:
+        """Its samples; of a feedback the most."""
+        inputs = self.inputs
+        return inputs.n_samples if isinstance(inputs, Feedback) else len(inputs)
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,7 @@ class ChosenRuns:
     @property
     def duration(self) -> float:
         """Length of all runs together [s]."""
-        return float(sum(len(run.inputs) * run.dt for run in self.runs))
+        return float(sum(run.n_samples * run.dt for run in self.runs))
 
 
 @dataclass(frozen=True)
@@ -194,7 +202,9 @@ def design(
     phantoms: list[str] = []
 
     def expected(by: Informant, excitation: Excitation, genes: FloatArray) -> FloatArray | None:
-        records = bench.records(excitation.signal(genes), excitation.dt, vectors)
+        inputs = excitation.signal(genes)
+        tried = vectors[: max(draws, FEW)] if isinstance(inputs, Feedback) else vectors
+        records = bench.records(inputs, excitation.dt, tried)
         if records is None:
             return None
         gained = _information(by, records[:draws], robust)
@@ -210,6 +220,11 @@ def design(
         phantoms.append(excitation.name)
         return None
 
+    def confirm(candidate: RunCandidate) -> bool:
+        inputs, dt = candidate.excitation.signal(candidate.genes), candidate.excitation.dt
+        feedback = isinstance(inputs, Feedback)
+        return not feedback or bench.records(inputs, dt, vectors) is not None
+
     def settled(candidate: RunCandidate) -> RunCandidate:
         gained = expected(exact, candidate.excitation, candidate.genes)
         return candidate if gained is None else replace(candidate, information=gained)
@@ -218,7 +233,7 @@ def design(
     gradients = relative_gradients(wanted, space, robust)
     of_information = criteria.Criterion(criterion, information, gradients, goals)
     workers = Workers(available_cores())
-    search = Search(excitations, evaluate, of_information, rng, runs, workers, watch)
+    search = Search(excitations, evaluate, of_information, rng, runs, workers, watch, confirm)
     search.run(candidates, generations, offspring)
     search.settle(settled)
     total = search.total()
@@ -229,7 +244,7 @@ def design(
         structure.unseen,
         total[0],
         attempts=search.attempts,
-        refused=search.attempts - len(search.pool),
+        refused=search.attempts - search.kept,
         phantoms=len(phantoms),
     )
 

@@ -28,6 +28,10 @@ _MOVES = 0.6, 0.2, 0.2  # of a setting that is moved alone: nearby, anywhere, to
 _HALVINGS = 3  # of the way from a run that passes a limit to one that does not
 _ROUNDS = 20  # of exchanges
 _GAIN = 1e-9  # by which an exchange must lower the loss
+_NONE = (
+    "each of {} runs that were tried would pass a limit; let the settings reach down to less, or "
+    "know the parameters better"
+)
 
 
 class Aim(Protocol):
@@ -71,7 +75,8 @@ class Search:
 
     attempts: runs that were simulated; chosen: the set, as places in ``pool``, the same one perhaps
     several times. workers: who evaluate. watch: is told the attempts and those within the limits
-    after each.
+    after each. confirm: whether a candidate that is to be chosen keeps limits of which ``evaluate``
+    has asked too few; None: it has asked all.
     """
 
     excitations: Sequence[Excitation]
@@ -81,10 +86,13 @@ class Search:
     most: int
     workers: Workers
     watch: Callable[[int, int], None] | None = None
+    confirm: Callable[[RunCandidate], bool] | None = None
 
     def __post_init__(self) -> None:
         self.pool: list[RunCandidate] = []
         self.chosen: list[int] = []
+        self._sure: set[int] = set()  # of the places, those that were confirmed
+        self._out: list[int] = []  # and those that were not
         self.attempts = self.kept = 0
 
     def run(self, candidates: int, generations: int, offspring: int) -> None:
@@ -115,10 +123,7 @@ class Search:
             trials.append(_Trial(excitation, genes, excitation.calmer))
         self._settle(trials)
         if not self.pool:
-            raise ModelError(
-                f"each of {n} runs that were tried would pass a limit; let the settings "
-                "reach down to less, or know the parameters better"
-            )
+            raise ModelError(_NONE.format(n))
 
     def generation(self, n: int, progress: float) -> None:
         """Offspring of the chosen; progress: 0 at the first generation, 1 at the last."""
@@ -166,16 +171,43 @@ class Search:
             self.revise(revised, sorted({*self.chosen} - settled))
             settled.update(self.chosen)
             self._greedily(np.array([candidate.information for candidate in self.pool]))
+            while not self._confirmed():
+                self._greedily(np.array([candidate.information for candidate in self.pool]))
 
     def choose(self) -> None:
-        """The best set that greed and exchanges lead to."""
-        stack = np.array([candidate.information for candidate in self.pool])
-        if not self.chosen:
+        """The best set that greed and exchanges lead to, of candidates that are confirmed.
+
+        Raises ModelError where none of them is.
+        """
+        while True:
+            stack = np.array([candidate.information for candidate in self.pool])
             self._greedily(stack)
-        for _ in range(_ROUNDS):
-            exchanged = [self._exchange(stack, place) for place in range(len(self.chosen))]
-            if not any(exchanged):
-                break
+            for _ in range(_ROUNDS):
+                exchanged = [self._exchange(stack, place) for place in range(len(self.chosen))]
+                if not any(exchanged):
+                    break
+            if self._confirmed():
+                return
+
+    def _confirmed(self) -> bool:
+        """Whether all that are chosen keep all limits; those that do not are out of it."""
+        if self.confirm is None:
+            return True
+        doubtful = sorted({*self.chosen} - self._sure)
+        kept = dict.fromkeys(doubtful, False)
+
+        def ask(place: int) -> None:
+            kept[place] = self.confirm is None or self.confirm(self.pool[place])
+
+        self.workers.each(ask, doubtful)
+        refused = {place for place in doubtful if not kept[place]}
+        self._sure.update(kept.keys() - refused)
+        self._out += sorted(refused)
+        self.kept -= len(refused)
+        if len(self._out) == len(self.pool):
+            raise ModelError(_NONE.format(len(self.pool)))
+        self.chosen = [place for place in self.chosen if place not in refused]
+        return not refused
 
     def total(self) -> FloatArray:
         """Information of the chosen together, (n_draws, n_free, n_free)."""
@@ -186,13 +218,19 @@ class Search:
         """One more run after the other, until there are enough or all targets are met."""
         total = stack[self.chosen].sum(axis=0)
         while len(self.chosen) < self.most and not self.aim.met(total):
-            self.chosen.append(int(np.argmin(self.aim.losses(total + stack))))
+            self.chosen.append(int(np.argmin(self._losses(total + stack))))
             total = total + stack[self.chosen[-1]]
+
+    def _losses(self, information: FloatArray) -> FloatArray:
+        """Of information (n_pool, n_draws, n_free, n_free), (n_pool,)."""
+        losses = self.aim.losses(information)
+        losses[self._out] = np.inf
+        return losses
 
     def _exchange(self, stack: FloatArray, place: int) -> bool:
         """Replace a chosen run by the best for its place; whether that was another."""
         others = self.total() - stack[self.chosen[place]]
-        losses = self.aim.losses(others + stack)
+        losses = self._losses(others + stack)
         best = int(np.argmin(losses))
         better = bool(losses[best] < losses[self.chosen[place]] - _GAIN)
         if better:
