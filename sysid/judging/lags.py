@@ -3,8 +3,9 @@
 Every output is regressed on what it was before, and on all inputs from long before to
 long after (an ARX model that may foresee). Of a sampled plant the first input that counts is that
 of the same sample or the one before, and it counts at once: numerators of plants sampled with a
-hold begin 1; 1, 1; 1, 4, 1 (Astrom, Hagander & Sternby, "Zeros of sampled systems", Automatica 20,
-1984). Where clearly nothing stands before a later sample, and there at once much, a channel lags.
+hold begin 1; 1, 1; 1, 4, 1; 1, 11, 11, 1; 1, 26, 66 by how often they integrate (Astrom, Hagander &
+Sternby, "Zeros of sampled systems", Automatica 20, 1984). Where clearly nothing stands before a
+later sample, and there at once much, a channel lags; little that is clearly there is a beginning.
 What is not clear is no lag: inputs that move together, or that a controller makes of outputs.
 """
 
@@ -26,6 +27,9 @@ _ROWS_EACH = 4  # rows for each coefficient
 _SINGULAR = 1e-7  # of the largest singular value, below which columns say the same
 _SURE = 8.0  # deviations at which a coefficient stands clear
 _AT_ONCE = 6.0  # how many times what stands before it, two deviations of that included
+# Deviations from which the one before it is there, and how many times that an input which begins so
+# may grow in a sample.
+_THERE, _BEGINNING = 2.5, 40.0
 _HELD = 0.5  # share of samples that repeat the one before, from where no controller makes an input
 
 
@@ -170,6 +174,10 @@ def _onset(coefficients: FloatArray, deviations: FloatArray) -> int | None:
     first = int(clear[0])
     before = np.abs(coefficients[:first]) + 2.0 * deviations[:first]
     if first == 0 or np.any(_AT_ONCE * before > abs(coefficients[first])):
+        return None
+    little = abs(coefficients[first - 1])
+    begins = little > _THERE * deviations[first - 1]
+    if begins and abs(coefficients[first]) < _BEGINNING * little:
         return None
     return first - _REACH
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from benchmarks._stress_cases import CORRECT, MODEL, MORE_CORRECT, cases
 from benchmarks.stress import fitted
@@ -68,3 +69,15 @@ def test_it_is_a_fault_of_the_data_that_the_verdict_names():
     verdict = verdict_of(fitted(case, training, 0), training, [validation])
     assert verdict.parameters.trust == "limited"
     assert verdict.parameters.reasons[0] == fault.sentence
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0, 2.0, 4.0, 8.0])
+def test_a_plant_that_integrates_four_times_begins_gently(noise):
+    """An angle by a brake's command: sampled with a hold, its numerator is 1, 11, 11, 1."""
+    rng, n = np.random.default_rng(1), 4000
+    denominator = np.poly([0.9, 0.8, 0.7, 0.6])
+    u, error = np.repeat(rng.normal(size=n // 4), 4), noise * rng.normal(size=n)
+    y = lfilter([0.0, 1.0, 11.0, 11.0, 1.0], denominator, u) + lfilter([1.0], denominator, error)
+    assert lags([Dataset(u, y, 0.01)]) == ()
+    late = lfilter([0.0] * 4 + [40.0], denominator, u) + lfilter([1.0], denominator, error)
+    assert lags([Dataset(u, late, 0.01)]) == (Lag(0, 0, 3),)
