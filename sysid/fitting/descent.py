@@ -28,6 +28,7 @@ NOTHING = 1e-3  # share of the error that is not worth a change of perturbations
 _STEADIER, _BRACINGS = 1.5, 3
 # Parts of the ranges within which integration steps, and corrections, need not be chosen anew.
 _NEAR = 1e-3
+_CRAWLS = 5  # iterations that gain little, from which on it stays so
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,8 @@ class Descent:
     smoothing: which of ``FLOORS``. backward: coordinates whose neighbours are taken on the
     other side, because simulations fail on the usual one. cautious: whether lambda shortens all
     steps, since one has led to where simulations fail. shift: of a descent by coarse simulations,
-    which their residuals are corrected by.
+    which their residuals are corrected by. crawling: iterations in a row that gained little of what
+    was promised; goal: an error above which a descent that crawls is given up.
     """
 
     point: Point
@@ -122,6 +124,13 @@ class Descent:
     tolerance: float = TOLERANCE
     restriction: Restriction = FREE
     shift: Shift | None = None
+    crawling: int = 0
+    goal: float = np.inf
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether it crawls, far from where its end would be of interest."""
+        return self.crawling >= _CRAWLS and self.point.error > self.goal
 
     @property
     def is_corrected(self) -> bool:
@@ -140,7 +149,8 @@ class Descent:
         """The state in plain values and arrays, of one that nothing restricts."""
         at, error = (None, np.inf) if self.safe is None else (self.safe.at, self.safe.error)
         state = vars(self) | vars(self.point) | {"sure": at, "sure_error": error}
-        del state["point"], state["safe"], state["restriction"], state["shift"]
+        for name in ("point", "safe", "restriction", "shift", "crawling", "goal"):
+            del state[name]
         return state
 
     @classmethod

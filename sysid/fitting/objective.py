@@ -22,6 +22,7 @@ import numpy as np
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.compiler import is_differentiable
 from sysid.engine.simulation import BatchResult, BatchSimulator, Residuals
+from sysid.fitting.slopes import SlopeBlock, Slopes
 from sysid.problem.data import Dataset, output_scale
 from sysid.problem.model import ModelError
 from sysid.problem.space import SearchSpace
@@ -58,13 +59,13 @@ class Responses:
 class Linearisation:
     """Residuals at a point, and how they change beside it.
 
-    residual: (n_residuals, n_outputs). slopes: (n_residuals, n_outputs, n_free), by coordinates in
-    parts of their ranges. rms: (n_outputs,). excess: as of ``Point``. errors: (n_free,), of the
-    neighbours that slopes are differences to, infinite of those without a number.
+    residual: (n_residuals, n_outputs). slopes: by coordinates in parts of their ranges. rms:
+    (n_outputs,). excess: as of ``Point``. errors: (n_free,), of the neighbours that slopes are
+    differences to, infinite of those without a number.
     """
 
     residual: FloatArray
-    slopes: FloatArray
+    slopes: Slopes
     rms: FloatArray
     excess: float
     errors: FloatArray
@@ -237,10 +238,10 @@ class Objective:
         """The same objective with exact slopes, if its equations can be differentiated."""
         return self._with(exact_slopes=is_differentiable(self.simulator.model))
 
-    def tangents(self, chromosomes: FloatArray, n_steps: IntArray) -> FloatArray:
+    def tangents(self, chromosomes: FloatArray, n_steps: IntArray) -> list[tuple[SlopeBlock, ...]]:
         """Slopes of the residuals of free runs by search coordinates, through the steps exact.
 
-        n_steps: (n, n_records). (n, n_residuals, n_outputs, n_free), as of ``residuals``.
+        n_steps: (n, n_records). For each chromosome a block a record, as of ``residuals``.
         """
         space, model = self.space, self.simulator.model
         n, shared = len(chromosomes), len(space.index)
@@ -260,16 +261,15 @@ class Objective:
             moves, self.scales,
         )  # fmt: skip
         self._counter[0] += n * (shared + most)
-        slopes = np.zeros(
-            (n, self.n_residuals // len(model.outputs), len(model.outputs), len(space.parameters))
-        )
-        end = 0
+        end, of_records = 0, []
         for part, places in zip(parts, starts, strict=True):
             rows = slice(end, end := end + part.shape[1])
-            slopes[:, rows, :, :shared] = part[..., :shared]
-            for i, (column, _) in enumerate(places):
-                slopes[:, rows, :, column] = part[..., shared + i]
-        return slopes
+            columns = np.array([*range(shared), *(column for column, _ in places)], dtype=np.int64)
+            of_records.append((rows, columns, part[..., : len(columns)]))
+        return [
+            tuple(SlopeBlock(rows, columns, part[k]) for rows, columns, part in of_records)
+            for k in range(n)
+        ]
 
     def with_sample(self, responses: Responses, residual: FloatArray) -> Responses:
         """Responses with one residual more, (n,), as if of the output that counts most."""

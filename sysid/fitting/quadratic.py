@@ -43,6 +43,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.fitting.objective import Linearisation, Objective, Responses, smoothed
+from sysid.fitting.slopes import Slopes, triangle_of
 from sysid.problem.space import SearchSpace
 
 # The values of lambda that are tried, in parts of the middle one.
@@ -51,7 +52,6 @@ FIRST_DAMPING = 1e-2
 _LEAST_DAMPING, _LEAST_BY_TANGENTS, _MOST_DAMPING = 1e-14, 1e-18, 1e6
 # The same damping of all coordinates, in parts of the largest curvature.
 _EQUAL = 10.0 ** np.array([-5.0, -7.0, -9.0, -11.0])
-_ROWS = 1024  # that are made orthogonal at once
 _HOLDING_ROUNDS = 4  # in which the coordinates that hit a bound are held there
 _PART = 0.1  # of the undamped step, which tells how the valley bends
 _LENGTHS = np.array([1.0, 0.5, 0.25, 0.1, 0.03])  # of the undamped step
@@ -85,10 +85,7 @@ class Quadratic:
         """At a point, by the residuals and slopes there; floor: of the outputs' errors."""
         rms, weights = around.rms, objective.weights
         c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
-        slopes = around.slopes
-        if not np.isfinite(slopes).all():
-            slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-        root, right = _orthogonalised(slopes, around.residual, c)
+        root, right = around.slopes.triangle(around.residual, c)
         error = float(smoothed(rms, floor) @ weights)
         least, lengths = _LEAST_DAMPING, np.array([_PART])
         if objective.exact_slopes:
@@ -105,28 +102,6 @@ class Quadratic:
         """Whether it is finite and not flat; slopes at the edge of stability may overflow."""
         finite = np.isfinite(self.root).all() and np.isfinite(self.right).all()
         return bool(finite and self.root.any())
-
-
-def _orthogonalised(
-    slopes: FloatArray, residual: FloatArray, c: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """R and q of sum_j c_j |J_j d + e_j|^2 = |R d + q|^2 + what no step d changes.
-
-    H = R'R would lose what is told by less than 1e-8 of the most.
-    """
-    counted, n = np.flatnonzero(c > 0.0), slopes.shape[2]
-    rows = np.concatenate([slopes, residual[..., None]], axis=2)[:, counted]
-    rows = (rows * np.sqrt(c[counted])[:, None]).reshape(-1, n + 1)
-    whole = len(rows) // _ROWS * _ROWS
-    blocks = _triangle(rows[:whole].reshape(-1, _ROWS, n + 1))
-    rows = np.concatenate([blocks.reshape(-1, n + 1), rows[whole:], np.zeros((n + 1, n + 1))])
-    triangle = _triangle(rows)
-    return triangle[:n, :n], triangle[:n, n]
-
-
-def _triangle(rows: FloatArray) -> FloatArray:
-    """Triangles R of matrices A, (..., m, n), with R'R = A'A, (..., min(m, n), n)."""
-    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -248,7 +223,7 @@ def bent(
     steps = (offer.coordinates - at) / space.width
 
     def surplus(j: int) -> FloatArray:
-        foretold = around.residual[:, j] + steps @ around.slopes[:, j].T
+        foretold = around.residual[:, j] + around.slopes.along(steps, j)
         return ends.values[:, j, chosen].T - foretold
 
     diagonal = np.sum(quadratic.root**2, axis=0)
@@ -295,7 +270,7 @@ def _led(
     quadratic: Quadratic,
     added: FloatArray,
     free: BoolArray,
-    slopes: FloatArray,
+    slopes: Slopes,
     errors: Callable[[int], FloatArray],
 ) -> FloatArray:
     """Steps b of free coordinates with (H + added) b = -sum_j c_j J_j' e_j, (n, n_free) each.
@@ -305,7 +280,7 @@ def _led(
     pushes = np.zeros(free.shape)
     with np.errstate(over="ignore", invalid="ignore"):
         for j in np.flatnonzero(quadratic.factors > 0.0).tolist():
-            pushes += quadratic.factors[j] * (errors(j) @ slopes[:, j])
+            pushes += quadratic.factors[j] * slopes.pushes(errors(j), j)
     triangles = _triangles(quadratic.root[None], added, ~free)
     halves = _solved(np.swapaxes(triangles, 1, 2), np.where(free, -pushes, 0.0))
     return _solved(triangles, halves)
@@ -378,7 +353,7 @@ def _triangles(
     rows[..., n + places, places] = np.where(stay, 1.0, np.sqrt(added))
     if wanted is not None:
         rows[..., :n, n] = wanted
-    return _triangle(rows)
+    return triangle_of(rows)
 
 
 def _solved(systems: FloatArray, right: FloatArray) -> FloatArray:

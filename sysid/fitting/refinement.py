@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import FloatArray, IntArray
 from sysid.fitting.descent import (
     FREE,
     NOTHING,
@@ -50,11 +50,13 @@ from sysid.fitting.quadratic import (
     heavier,
     restored,
 )
+from sysid.fitting.slopes import SlopeBlock, Slopes, joined, scaled
 from sysid.problem.space import SearchSpace
 
 MOST_ITERATIONS = 50
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
 _KEPT = 0.02  # share of the promise below which a gain counts as a failure
+_CRAWL = 0.2  # and below which it gets nowhere soon
 _LITTLE = 0.5  # share of the promise below which the valley bends
 _FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
 _BURST = 10.0  # a neighbour's error that is so much larger has left the edge of stability
@@ -117,7 +119,7 @@ def refine_each(
             break
         descents = advance(objective, descents)
         for i in live:
-            if enough(descents[i].point):
+            if descents[i].is_given_up or enough(descents[i].point):
                 descents[i] = replace(descents[i], finished=True)
     points = [descent.point for descent in descents]
     ends = [objective.space.decode(point.at) for point in points]
@@ -148,18 +150,40 @@ def begin(
     return Descent(Point(at), tolerance=tolerance, restriction=restriction)
 
 
+def corrected(objective: Objective, chromosome: FloatArray) -> Descent | None:
+    """A descent by coarse simulations where its corrections are known; None by others."""
+    if objective.coarse is objective:
+        return None
+    return _ready(objective, [begin(objective, chromosome)])[0]
+
+
+def beside(space: SearchSpace, descent: Descent, near: Descent | None) -> Descent:
+    """A descent that begins with the steps and corrections of another, if it is not far from it."""
+    if near is None or near.steps_at is None or _is_far(space, descent.point.at, near.steps_at):
+        return descent
+    return replace(descent, steps=near.steps, steps_at=near.steps_at, shift=near.shift)
+
+
 def errors_of(objective: Objective, descents: Sequence[Descent]) -> FloatArray:
     """Errors (n,) where descents stand, their restrictions' included, infinite where one failed."""
-    chromosomes = objective.space.decode(np.stack([descent.point.at for descent in descents]))
+    errors = np.empty(len(descents))
+    at = np.stack([descent.point.at for descent in descents])
+    sure = [i for i, descent in enumerate(descents) if descent.is_corrected]
+    by_coarse = _responses(objective.coarse, [descents[i] for i in sure], list(at[sure, None]))
+    for i, responses in zip(sure, by_coarse, strict=True):
+        errors[i] = objective.error_of(responses.rms)[0]
+    others = [i for i, descent in enumerate(descents) if not descent.is_corrected]
+    if not others:
+        return errors
+    chromosomes = objective.space.decode(at[others])
     rms, none = objective.rms(chromosomes), np.zeros((0, *objective.weights.shape, 1))
-    errors = []
-    for descent, chromosome, each in zip(descents, chromosomes, rms, strict=True):
+    for i, chromosome, each in zip(others, chromosomes, rms, strict=True):
         responses = Responses(none, each[None], np.zeros(1))
-        tether = descent.restriction.tether
+        tether = descents[i].restriction.tether
         if tether is not None:
             responses = objective.with_sample(responses, tether(chromosome[None]))
-        errors.append(objective.error_of(responses.rms)[0])
-    return np.array(errors)
+        errors[i] = objective.error_of(responses.rms)[0]
+    return errors
 
 
 def simulations_per_iteration(objective: Objective) -> int:
@@ -259,7 +283,7 @@ def _surveyed(
         if turned != descent.backward:
             return replace(descent, backward=turned), None
         # The rest of the parameters go on alone.
-        around.slopes[..., burst] = 0.0
+        around = replace(around, slopes=around.slopes.without(burst))
     if not np.isfinite(descent.error_of_round):
         descent = replace(descent, error_of_round=error)
     quadratic = Quadratic.at(objective, around, descent.floor)
@@ -279,7 +303,7 @@ def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Res
         at, damping = offer.coordinates[best], float(offer.damping[best])
         error = float(objective.error_of(ends.rms[best : best + 1])[0])
         point = Point(at, error, ends.rms[best], float(ends.excess[best]))
-        far = np.any(np.abs(at - descent.steps_at) > _FAR * objective.space.width)
+        far = _is_far(objective.space, at, descent.steps_at)
         steps_at = None if far else descent.steps_at
         descent = replace(descent, point=point, steps_at=steps_at, gain=gain)
     promising, behind = offer.promise > NOTHING, gain < _KEPT * offer.promise
@@ -288,12 +312,18 @@ def _judged(objective: Objective, descent: Descent, offer: Candidates, ends: Res
     once_more = behind and little and not descent.failures
     failed = gain <= 0.0 or once_more or (behind and promising)
     failures = descent.failures + 1 if failed else 0
-    descent = replace(descent, damping=damping, failures=failures)
+    crawling = descent.crawling + 1 if gain < _CRAWL * offer.promise else 0
+    descent = replace(descent, damping=damping, failures=failures, crawling=crawling)
     if failures >= PATIENCE and promising:
         return resumed(objective, descent, "misled")
     if failures >= PATIENCE or (little and not failed):
         return resumed(objective, descent, "arrived")
     return descent
+
+
+def _is_far(space: SearchSpace, at: FloatArray, chosen: FloatArray) -> bool:
+    """Whether integration steps, and corrections, that were chosen elsewhere may not do."""
+    return bool(np.any(np.abs(at - chosen) > _FAR * space.width))
 
 
 def _gains(objective: Objective, descent: Descent, ends: Responses) -> FloatArray:
@@ -314,14 +344,27 @@ def _ready(objective: Objective, descents: list[Descent]) -> list[Descent]:
         return descents
     at = np.stack([descent.point.at for descent in lacking.values()])
     chromosomes = objective.space.decode(at)
-    steps = objective.steps_needed(chromosomes)
-    exact = objective.residuals(chromosomes, steps).values
+    steps, exact = _exactly(objective, chromosomes, list(lacking.values()))
     fewer = np.array([descent.steps for descent in lacking.values()])
     less = coarse.residuals(chromosomes, fewer).values
     for k, (i, descent) in enumerate(lacking.items()):
         shift = Shift(at[k], tuple(steps[k].tolist()), descent.steps, (exact - less)[..., k])
-        descents[i] = replace(descent, shift=shift)
+        descents[i] = replace(descent, shift=shift, steps_at=at[k])
     return descents
+
+
+def _exactly(
+    objective: Objective, chromosomes: FloatArray, descents: Sequence[Descent]
+) -> tuple[IntArray, FloatArray]:
+    """Steps (n, n_records) that suffice, and residuals by them; those before if they still do."""
+    shifts = [descent.shift for descent in descents]
+    if all(shifts):
+        steps = np.array([shift.steps for shift in shifts if shift])
+        before = objective.residuals(chromosomes, steps)
+        if np.all(before.excess <= 1.0):
+            return steps, before.values
+    steps = objective.steps_needed(chromosomes)
+    return steps, objective.residuals(chromosomes, steps).values
 
 
 def _with_steps(objective: Objective, descents: list[Descent]) -> list[Descent]:
@@ -367,12 +410,8 @@ def _linearised(objective: Objective, descents: list[Descent]) -> list[Linearisa
     rows = [descent.point.at[None] for descent in descents]
     steps = np.array([descent.steps for descent in descents])
     tangents = objective.tangents(space.decode(np.concatenate(rows)), steps)
-    return [
-        _by_tangents(objective, descent, *pair)
-        for descent, *pair in zip(
-            descents, _responses(objective, descents, rows), tangents, strict=True
-        )
-    ]
+    here = _responses(objective, descents, rows)
+    return [_by_tangents(objective, *each) for each in zip(descents, here, tangents, strict=True)]
 
 
 def _by_differences(objective: Objective, around: Responses, distance: FloatArray) -> Linearisation:
@@ -380,25 +419,25 @@ def _by_differences(objective: Objective, around: Responses, distance: FloatArra
         slopes = (around.values[..., 1:] - around.values[..., :1]) / distance
     errors = objective.error_of(around.rms[1:])
     excess = float(around.excess[0])
-    return Linearisation(around.values[..., 0], slopes, around.rms[0], excess, errors)
+    return Linearisation(around.values[..., 0], Slopes.of(slopes), around.rms[0], excess, errors)
 
 
 def _by_tangents(
-    objective: Objective, descent: Descent, here: Responses, tangents: FloatArray
+    objective: Objective, descent: Descent, here: Responses, tangents: tuple[SlopeBlock, ...]
 ) -> Linearisation:
-    """tangents: (n_samples, n_outputs, n_free), by the search coordinates."""
+    """tangents: by the search coordinates."""
     space, tether = objective.space, descent.restriction.tether
-    slopes = tangents * space.width
+    slopes = scaled(tangents, space.width)
     if tether is not None:
         shift = _OF_TETHER * np.diag(space.width)
         ahead, behind = (
             tether(space.decode(descent.point.at + way * shift)) for way in (1.0, -1.0)
         )
-        row = np.zeros((1, *slopes.shape[1:]))
-        row[0, int(np.argmax(objective.weights))] = (ahead - behind) / (2.0 * _OF_TETHER)
-        slopes = np.concatenate([slopes, row])
+        row = np.zeros((len(objective.weights), len(space.width)))
+        row[int(np.argmax(objective.weights))] = (ahead - behind) / (2.0 * _OF_TETHER)
+        slopes = joined(slopes, row)
     error = float(objective.error_of(here.rms)[0])
-    errors = np.where(np.isfinite(slopes).all(axis=(0, 1)), error, np.inf)
+    errors = np.where(slopes.finite, error, np.inf)
     return Linearisation(here.values[..., 0], slopes, here.rms[0], float(here.excess[0]), errors)
 
 

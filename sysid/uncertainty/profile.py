@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from sysid.arrays import FloatArray
 from sysid.fitting.descent import Descent, Point
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import errors_of, refine_each
+from sysid.fitting.refinement import beside, corrected, errors_of, refine_each
 from sysid.problem.model import ModelError
 from sysid.uncertainty.covariance import Covariance, covariance
 from sysid.uncertainty.estimate import Z95
@@ -22,6 +22,9 @@ _STEPS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)  # standard deviations, outwar
 _ITERATIONS = 20
 # A parameter without a standard deviation is moved by parts of its range.
 _BLIND_SHARE = 0.05
+_FAR_OUT = (
+    4.0  # times the level, from where it does not matter by how much more a place explains less
+)
 _RESOLUTION = 0.02  # of the statistic, to which refits go
 _REFITS, _NEAR = 20, 0.1  # of one end, until the root of the statistic is so near its level,
 _GAP = 0.02  # or two fits on both sides of it so near each other, in parts of the way there
@@ -120,7 +123,7 @@ def traced(
     fits: is given all that were made on the way.
     """
     results: dict[int, _Result] = {}
-    least: dict[tuple[int, ...], float] = {}
+    base = _Base(searches[0][0]) if searches else None
     answers: dict[int, Fit | None] = dict.fromkeys(range(len(searches)))
     while answers:
         wanted: dict[int, Wanted] = {}
@@ -129,48 +132,70 @@ def traced(
                 wanted[i] = searches[i][1].send(answer)  # type: ignore[arg-type]  # None begins it
             except StopIteration as end:
                 results[i] = end.value
-        if not wanted:
+        if not wanted or base is None:
             break
-        made = _fitted([(searches[i][0], task) for i, task in wanted.items()], least)
+        made = base.fitted([(searches[i][0], task) for i, task in wanted.items()])
         answers = dict(zip(wanted, made, strict=True))
         if fits is not None:
             fits += made
     return [results[i] for i in range(len(searches))]
 
 
-def _fitted(
-    tasks: Sequence[tuple["Tracer", Wanted]], least: dict[tuple[int, ...], float]
-) -> list[Fit]:
-    """The best fits to places, of tracers around one estimate.
+class _Base:
+    """The estimate that profiles are around, and what is known there for all fits.
 
-    least: errors of the estimate by integration steps, those that are met are added.
+    least: its errors by integration steps; those that are met are added.
     """
-    objective, estimate = tasks[0][0].objective, tasks[0][0].local.chromosome
-    refined = iter(refine_each(objective, _begun(objective, tasks), _ITERATIONS))
-    each = [list(itertools.islice(refined, len(wanted.groups))) for _, wanted in tasks]
-    ends = [min(ended, key=lambda end: end.error) for ended in each]
-    worse = [max(end.error for end in ended) for ended in each]
-    for steps in {end.steps for end in ends if np.isfinite(end.error)} - least.keys():
-        rms = objective.residuals(estimate[None], steps, keep=False).rms
-        least[steps] = float(objective.error_of(rms)[0])
-    fits = []
-    for (tracer, wanted), end, worst in zip(tasks, ends, worse, strict=True):
-        loss = end.error - least.get(end.steps, 0.0)
-        at = objective.space.encode(end.chromosome)
-        alone = tracer.statistic(worst - end.error) > Z95**2
-        fits.append(Fit(wanted.place, tracer.statistic(loss), at, loss, alone))
-    return fits
 
+    def __init__(self, tracer: "Tracer") -> None:
+        self.objective, self.estimate = tracer.objective, tracer.local.chromosome
+        self.least: dict[tuple[int, ...], float] = {}
+        self.corrected = corrected(self.objective, self.estimate)
+        shift = None if self.corrected is None else self.corrected.shift
+        self.error = None if shift is None else self._error(shift.steps)
 
-def _begun(objective: Objective, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Descent]:
-    """Descents to each place, from the best of each group of what is near."""
-    groups = [(tracer, wanted.place, near) for tracer, wanted in tasks for near in wanted.groups]
-    offered = [tracer.begun(place, at) for tracer, place, near in groups for at in near]
-    errors = iter(errors_of(objective, offered))
-    descents = iter(offered)
-    return [
-        min((next(errors), i, next(descents)) for i in range(len(near)))[2] for *_, near in groups
-    ]
+    def fitted(self, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
+        """The best fits to places, of tracers around the estimate."""
+        objective = self.objective
+        refined = iter(refine_each(objective, self._begun(tasks), _ITERATIONS))
+        each = [list(itertools.islice(refined, len(wanted.groups))) for _, wanted in tasks]
+        ends = [min(ended, key=lambda end: end.error) for ended in each]
+        worse = [max(end.error for end in ended) for ended in each]
+        fits = []
+        for (tracer, wanted), end, worst in zip(tasks, ends, worse, strict=True):
+            loss = end.error - (self._error(end.steps) if np.isfinite(end.error) else 0.0)
+            at = objective.space.encode(end.chromosome)
+            alone = tracer.statistic(worst - end.error) > Z95**2
+            fits.append(Fit(wanted.place, tracer.statistic(loss), at, loss, alone))
+        return fits
+
+    def _error(self, steps: tuple[int, ...]) -> float:
+        """Of the estimate, by integration steps."""
+        if steps not in self.least:
+            rms = self.objective.residuals(self.estimate[None], steps, keep=False).rms
+            self.least[steps] = float(self.objective.error_of(rms)[0])
+        return self.least[steps]
+
+    def _offered(self, tracer: "Tracer", place: float, at: FloatArray) -> Descent:
+        descent = beside(self.objective.space, tracer.begun(place, at), self.corrected)
+        if self.error is None:
+            return descent
+        return replace(descent, goal=self.error + _FAR_OUT * Z95**2 / tracer.factor)
+
+    def _begun(self, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Descent]:
+        """Descents to each place, from the best of each group of what is near."""
+        groups = [
+            (tracer, wanted.place, near) for tracer, wanted in tasks for near in wanted.groups
+        ]
+        offered = [
+            self._offered(tracer, place, at) for tracer, place, near in groups for at in near
+        ]
+        errors = iter(errors_of(self.objective, offered))
+        descents = iter(offered)
+        return [
+            min((next(errors), i, next(descents)) for i in range(len(near)))[2]
+            for *_, near in groups
+        ]
 
 
 class Tracer:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,14 @@ from sysid import (
 from sysid.fitting import descent as stalls
 from sysid.fitting.descent import PERTURBATIONS, Descent, Point
 from sysid.fitting.objective import FLOORS, Objective
-from sysid.fitting.refinement import refine
+from sysid.fitting.refinement import (
+    begin,
+    beside,
+    corrected,
+    errors_of,
+    refine,
+    refine_each,
+)
 from tests.sysid.support import MOTOR, Formula, draw, lag, motor, motor_record
 
 
@@ -521,6 +529,53 @@ def test_a_descent_by_coarse_simulations_ends_where_exact_ones_would(without):
     assert end.error == pytest.approx(target.evaluate(end.chromosome[None])[0][0], rel=1e-3)
     once = without(stalls.correct, corrected, start)
     assert abs(once.chromosome[0] / exact - 1.0) > 5e-4
+
+
+def test_a_descent_with_the_corrections_of_another_ends_where_its_own_would(monkeypatch):
+    """It begins without simulations by finer steps: those of the other are still near."""
+    outputs = 2.0 * SINE + 0.01 * np.random.default_rng(0).normal(size=100)
+    target, rough = (
+        gain_objective(Formula, by_gain, outputs[:, None])
+        for by_gain in (lambda p, u: p["gain"] * u, lambda p, u: 1.01 * p["gain"] * u)
+    )
+    by_both, start = target.with_slopes_by(rough.simulator), np.array([1.9])
+    other = corrected(by_both, np.array([1.95]))
+    assert corrected(target, np.array([2.0])) is None  # nothing to correct
+    far, near = (begin(by_both, np.array([gain])) for gain in (0.01, 1.9))
+    assert beside(by_both.space, far, other) is far
+    lent, own = beside(by_both.space, near, other), refine(by_both, start)
+    finer = []
+    simulate = type(target.simulator).residuals
+
+    def counted(simulator, vectors, *others, **options):
+        if simulator is target.simulator:
+            finer.append(len(vectors))
+        return simulate(simulator, vectors, *others, **options)
+
+    monkeypatch.setattr(type(target.simulator), "residuals", counted)
+    by_lent = errors_of(by_both, [lent])
+    assert not finer
+    assert by_lent == pytest.approx(errors_of(by_both, [near]), rel=0.02)
+    finer.clear()
+    (end,) = refine_each(by_both, [lent])
+    assert len(finer) == 1  # where it ends
+    assert end.chromosome[0] == pytest.approx(own.chromosome[0], rel=1e-4)
+    assert end.error == pytest.approx(target.evaluate(end.chromosome[None])[0][0], rel=1e-3)
+
+
+def test_a_descent_that_crawls_far_from_its_goal_is_given_up(monkeypatch):
+    crawling = Descent(Point(np.zeros(1), 0.5), crawling=5, goal=0.4)
+    assert crawling.is_given_up
+    for other in ({"crawling": 4}, {"goal": 0.6}, {"goal": np.inf}):
+        assert not replace(crawling, **other).is_given_up
+    # A valley in which by these measures every iteration crawls.
+    monkeypatch.setattr("sysid.fitting.refinement._CRAWL", 1e9)
+    bent = gain_objective(Formula, lambda p, u: p["gain"] ** 9 * u, 2.0 * SINE[:, None] + 0.01)
+    end, cut = (
+        refine_each(bent, [replace(begin(bent, np.array([0.2])), goal=goal)])[0]
+        for goal in (np.inf, 0.0)
+    )
+    assert cut.iterations == 5 < end.iterations
 
 
 class InTwoSteps(Formula):

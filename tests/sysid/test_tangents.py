@@ -19,6 +19,7 @@ from sysid import (
     State,
 )
 from sysid.fitting.objective import Objective
+from sysid.fitting.slopes import Slopes
 from tests.sysid.support import blank
 
 DT = 0.01
@@ -209,7 +210,7 @@ def test_slopes_of_residuals_are_those_of_differences():
     objective = Objective(BatchSimulator(model), space, records)
     at = space.encode(np.array([*VALUES.values(), 0.3, -0.2]))
     steps = np.array([[2, 3]])
-    exact = objective.tangents(space.decode(at[None]), steps)[0]
+    exact = Slopes(objective.tangents(space.decode(at[None]), steps)[0], len(at)).dense
     shift = 1e-5 * np.eye(len(at))
     ahead, behind = (
         objective.residuals(space.decode(at + way * shift), steps[0]).values for way in (1.0, -1.0)
