@@ -27,7 +27,7 @@ from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, better_by_filter
-from sysid.gassi.lookalikes import hardly_felt, lookalikes
+from sysid.gassi.lookalikes import hardly_felt, lookalikes, trades
 from sysid.gassi.noise_fit import NoiseFit, foresees_more, too_well
 from sysid.gassi.optima import (
     LEAST_SHARE,
@@ -53,6 +53,8 @@ _CONCEIVABLE = 40.0  # the same of a minimum that has not been refined to its en
 _MOVING = 2.0  # deviations that errors of the integration may make on an excerpt
 _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _EXPLORED = 2  # minima whose lookalikes are descended from
+# Minima whose lags are traded by the last weights, and of what that leads to from each.
+_TRADED, _BEST_TRADED = 4, 3
 _EXPLORED_BY_FILTER = 5  # the same by a filter
 _SHARPER = (1e-4, 1e-6)  # shares of the largest error that each counts for, one after another
 _BETTER = 1.0  # deviance by which one of them has to be better than the one before
@@ -113,13 +115,14 @@ def fit_likelihood(
     process: FloatArray | None = None,
     begun: Begun | None = None,
     explored: bool = False,
+    felt: bool = False,
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
     noise: how all of them are refitted in the end, where inputs or the process are noisy; by
     innovations, too, where free runs would not do. process: as of ``Innovations``. begun: where
     descents begin as well; if it is settled nothing looks like the minima. explored: whether these
-    have their lookalikes among them.
+    have their lookalikes among them; felt: and what differs in what is hardly felt.
     """
     objective, begun = accurate(objective, minima[0]), begun or Begun()
     # A filter begins at the minima of free runs, and does not end there; what looks like a minimum
@@ -127,7 +130,7 @@ def fit_likelihood(
     roughly = noise == "innovations"
     lookalike = not (explored or begun.is_settled or roughly)
     minima = minima if roughly else [*minima, *begun.chromosomes]
-    beside = not (begun.is_settled or roughly)
+    beside = not (begun.is_settled or roughly or felt)
     optima = _explored(
         objective, minima, watch, lookalike=lookalike, beside=beside, roughly=roughly
     )
@@ -250,6 +253,25 @@ def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Opt
         for optimum in (best, *near):
             optima.add(_weighed(objective, optimum.chromosome, watch, least=least))
         last = least
+    return _traded(objective, optima, watch, last) if last < LEAST_SHARE else optima
+
+
+def _traded(objective: Objective, optima: Optima, watch: Watch | None, least: float) -> Optima:
+    """Minima with lags traded among them, which coarser weights do not tell from one another.
+
+    From a better one on anew; of those that are as good the best few.
+    """
+    for _ in range(_TRADED):
+        best = optima.ranked()[0]
+        starts = trades(best.objective, best.chromosome)
+        ends = _conceivable(best.objective, starts, optima, best)
+        for end in sorted(ends, key=lambda end: end.error)[:_BEST_TRADED]:
+            if optima.new(end.chromosome):
+                optima.add(_weighed(objective, end.chromosome, watch, least=least))
+            if optima.deviance(best, optima.ranked()[0]) > _BETTER:
+                break
+        else:
+            break
     return optima
 
 

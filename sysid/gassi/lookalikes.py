@@ -25,6 +25,7 @@ import numpy as np
 from sysid.arrays import BoolArray, ComplexArray, FloatArray
 from sysid.fitting.objective import Objective
 from sysid.gassi.responses import alike_directions, alike_responses
+from sysid.problem.space import SearchSpace
 from sysid.response.linearization import linear_models
 
 _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could be mistaken
@@ -41,6 +42,7 @@ _ACTING = 1e-4  # parameters that move the mode less than this part of what the 
 _OWN, _FOREIGN = 0.5, 0.25
 _REACHED = 0.02  # part of the frequency by which the end may miss the alias
 _SCANNED = 8  # places along a direction that only ends of ranges tell
+_LEAST = float(np.finfo(np.float64).tiny)
 _SAME = 1e-5  # part of the error by which places that are as good may differ
 
 
@@ -48,7 +50,7 @@ def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]
     """Chromosomes (n_free,) in the ranges of which a fast mode is this one's or an alias of it."""
     fastest, dt = _Modes(objective, chromosome), objective.records[0].dt
     swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
-    traded = _trades(fastest, chromosome)
+    traded = _traded(fastest, chromosome)
     starts = _harmless(objective, chromosome, [*swapped, *traded, *alike], _HARM)
     starts += _beyond_ends(objective, chromosome)
     for modes in (fastest, *fastest.others(2.0 * np.pi * _FASTEST_SEEN / dt)):
@@ -61,11 +63,7 @@ def _harmless(
 ) -> list[FloatArray]:
     """Starts (n_free,) in the ranges whose error is less than so many times a chromosome's."""
     rows = np.stack([chromosome, *starts])
-    coded = objective.space.encode(
-        np.maximum(rows, np.finfo(np.float64).tiny * objective.space.log)
-    )
-    lower, upper = objective.space.coded_bounds
-    admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
+    admitted = np.array([_within(objective.space, row) for row in rows])
     errors, _ = objective.evaluate(np.where(admitted[:, None], rows, chromosome))
     kept = admitted & (errors < harm * errors[0])
     return list(rows[1:][kept[1:]])
@@ -118,7 +116,21 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
     return list(swapped)
 
 
-def _trades(modes: _Modes, chromosome: FloatArray) -> list[FloatArray]:
+def trades(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
+    """Chromosomes (n_free,) in the ranges with the rates of two lags traded."""
+    space = objective.space
+    traded = _traded(_Modes(objective, chromosome), chromosome)
+    return [each for each in traded if _within(space, each)]
+
+
+def _within(space: SearchSpace, chromosome: FloatArray) -> bool:
+    # What is traded may come to zero, and a start that is no logarithm below it.
+    coded = space.encode(np.where(space.log, np.maximum(chromosome, _LEAST), chromosome))
+    lower, upper = space.coded_bounds
+    return bool(np.all((coded >= lower) & (coded <= upper)))
+
+
+def _traded(modes: _Modes, chromosome: FloatArray) -> list[FloatArray]:
     """Chromosomes with the rates of two lags traded, each through one parameter.
 
     As those of an amplifier and of the winding behind it, which outputs hardly tell apart.

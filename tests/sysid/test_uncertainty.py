@@ -766,16 +766,23 @@ def test_a_descent_along_a_bent_valley_comes_to_its_end():
     np.testing.assert_allclose(reached.chromosome, end.chromosome, rtol=1e-3)
 
 
-def test_a_better_minimum_in_what_is_hardly_felt_is_found():
-    """Two minima in w, at e and near 1 / e, apart by a few hundredths of the error."""
+@pytest.mark.parametrize("offset", [0.5, -2.0])
+def test_a_better_minimum_in_what_is_hardly_felt_is_found(offset):
+    """Two minima in w, at e and near 1 / e, apart by a few hundredths of the error.
+
+    Beside an offset, which may have a range below zero.
+    """
 
     def formula(p, u):
         w = np.log(p["w"])
-        return columns(p["k"] * u[:, 0] + 0.02 * (w**2 - 1.0) * u[:, 1] + 0.01 * w * u[:, 2])
+        seen = 0.02 * (w**2 - 1.0) * u[:, 1] + 0.01 * w * u[:, 2]
+        return columns(p["k"] * u[:, 0] + seen + p["f0"])
 
     w = unknown("w", math.e, lower=math.exp(-2.0), upper=math.exp(2.0))
-    objective = Problem(formula, [unknown("k", 1.0), w], sigma=0.1, n=2000, seed=1).objective()
-    begun = refine(objective, np.array([1.0, 0.4])).chromosome
+    f0 = unknown("f0", offset, "linear", lower=offset - 1.0, upper=offset + 1.0)
+    free = [unknown("k", 1.0), w, f0]
+    objective = Problem(formula, free, sigma=0.1, n=2000, seed=1).objective()
+    begun = refine(objective, np.array([1.0, 0.4, offset])).chromosome
     assert begun[1] < 0.6
     reached = fit_likelihood(objective, [begun], explored=True).optimum
     assert reached.chromosome[1] == pytest.approx(math.e, rel=0.15)
