@@ -348,7 +348,10 @@ class GASSI(RecordEstimator):
         # What looks like a filter's minimum it tells itself, by all of the records.
         lookalike = lookalike and self.criterion_ != "innovations"
         most = _ALIKE_BY_PARTS if excerpt.cut else _ALIKE_BY_ALL
-        minima = promising(searched, minima, watch, lookalike=lookalike, most=most)
+        sharpens = self.criterion_ not in _OF_NOISY_INPUTS
+        minima = promising(
+            searched, minima, watch, lookalike=lookalike, most=most, sharpens=sharpens
+        )
         return minima if excerpt.cut else excerpt.on_all(searched.space, minima)[1]
 
     def _maximise_likelihood(

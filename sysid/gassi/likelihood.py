@@ -27,7 +27,7 @@ from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import MOST_ITERATIONS, Refinement, begin, refine, refine_each
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import SAMPLES, better_by_filter
-from sysid.gassi.lookalikes import hardly_felt, lookalikes, trades
+from sysid.gassi.lookalikes import hardly_felt, lookalikes
 from sysid.gassi.noise_fit import NoiseFit, foresees_more, too_well
 from sysid.gassi.optima import (
     LEAST_SHARE,
@@ -53,8 +53,8 @@ _CONCEIVABLE = 40.0  # the same of a minimum that has not been refined to its en
 _MOVING = 2.0  # deviations that errors of the integration may make on an excerpt
 _AT_ONCE = 8  # descents side by side, which later ones need not repeat
 _EXPLORED = 2  # minima whose lookalikes are descended from
-# Minima whose lags are traded by the last weights, and of what that leads to from each.
-_TRADED, _BEST_TRADED = 4, 3
+# Minima whose lookalikes are descended from by the last weights, and the best ends of each.
+_SHARP_ROUNDS, _SHARP_ENDS = 4, 3
 _EXPLORED_BY_FILTER = 5  # the same by a filter
 _SHARPER = (1e-4, 1e-6)  # shares of the largest error that each counts for, one after another
 _BETTER = 1.0  # deviance by which one of them has to be better than the one before
@@ -132,8 +132,9 @@ def fit_likelihood(
     minima = minima if roughly else [*minima, *begun.chromosomes]
     beside = not (begun.is_settled or roughly or felt)
     optima = _explored(
-        objective, minima, watch, lookalike=lookalike, beside=beside, roughly=roughly
-    )
+        objective, minima, watch, lookalike=lookalike, beside=beside, roughly=roughly,
+        sharpens=noise is None,
+    )  # fmt: skip
     if not roughly:
         objective, optima = _in_noise(objective, optima, watch)
     if noise is None:
@@ -175,13 +176,16 @@ def promising(
     *,
     most: int,
     lookalike: bool = True,
+    sharpens: bool = False,
 ) -> list[FloatArray]:
     """Of some minima (n_free,), and perhaps their lookalikes, those that more data may favour.
 
     The best first; where they are is known roughly, for they are meant to be fitted to their end,
-    as many as that is affordable for.
+    as many as that is affordable for. sharpens: as of ``_explored``.
     """
-    optima = _explored(objective, minima, watch, lookalike=lookalike, roughly=True)
+    optima = _explored(
+        objective, minima, watch, lookalike=lookalike, roughly=True, sharpens=sharpens
+    )
     best, *others = optima.ranked()
     near = [rival for rival in others if optima.deviance(rival, best) < TOLD_APART]
     return [optimum.chromosome for optimum in (best, *near)[:most]]
@@ -207,15 +211,19 @@ def _explored(
     lookalike: bool,
     beside: bool = False,
     roughly: bool = False,
+    sharpens: bool = False,
 ) -> Optima:
     """Minima (n_free,) refined by likelihood, and those that look like the best.
 
     Without lookalikes the first is the best, and the others are refined as long as they may be it.
-    beside: whether those are looked for that differ in what is hardly felt.
+    beside: whether those are looked for that differ in what is hardly felt. sharpens: whether where
+    an output tells far more that is left to its own weights.
     """
     optima = Optima(objective)
     for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
+    if sharpens and _is_sharp(objective, optima.ranked()[0]):
+        return optima
     explored = None
     for _ in range(_EXPLORED if lookalike or beside else 1):
         best = optima.ranked()[0]
@@ -241,8 +249,7 @@ def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Opt
     last = LEAST_SHARE
     for least in _SHARPER:
         best, *others = optima.ranked()
-        rms = best.rms[objective.weights > 0.0]
-        if rms.min() >= last * rms.max():
+        if not _is_sharp(objective, best, last):
             break
         near = [o for o in others if optima.deviance(o, best) < _CONCEIVABLE]
         finer = fine_enough(best.objective, best.chromosome, bounded(best.rms, least))
@@ -253,19 +260,27 @@ def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Opt
         for optimum in (best, *near):
             optima.add(_weighed(objective, optimum.chromosome, watch, least=least))
         last = least
-    return _traded(objective, optima, watch, last) if last < LEAST_SHARE else optima
+    return _with_lookalikes(objective, optima, watch, last) if last < LEAST_SHARE else optima
 
 
-def _traded(objective: Objective, optima: Optima, watch: Watch | None, least: float) -> Optima:
-    """Minima with lags traded among them, which coarser weights do not tell from one another.
+def _is_sharp(objective: Objective, optimum: Optimum, share: float = LEAST_SHARE) -> bool:
+    """Whether an output errs less than a share of another: coarser weights then tell little."""
+    rms = optimum.rms[objective.weights > 0.0]
+    return bool(rms.min() < share * rms.max())
+
+
+def _with_lookalikes(
+    objective: Objective, optima: Optima, watch: Watch | None, least: float
+) -> Optima:
+    """Minima that look like the best, of which only the last weights tell, as with lags traded.
 
     From a better one on anew; of those that are as good the best few.
     """
-    for _ in range(_TRADED):
+    for _ in range(_SHARP_ROUNDS):
         best = optima.ranked()[0]
-        starts = trades(best.objective, best.chromosome)
+        starts = lookalikes(best.objective, best.chromosome, narrow=True)
         ends = _conceivable(best.objective, starts, optima, best)
-        for end in sorted(ends, key=lambda end: end.error)[:_BEST_TRADED]:
+        for end in sorted(ends, key=lambda end: end.error)[:_SHARP_ENDS]:
             if optima.new(end.chromosome):
                 optima.add(_weighed(objective, end.chromosome, watch, least=least))
             if optima.deviance(best, optima.ranked()[0]) > _BETTER:

@@ -25,7 +25,6 @@ import numpy as np
 from sysid.arrays import BoolArray, ComplexArray, FloatArray
 from sysid.fitting.objective import Objective
 from sysid.gassi.responses import alike_directions, alike_responses
-from sysid.problem.space import SearchSpace
 from sysid.response.linearization import linear_models
 
 _FASTEST_SEEN = 0.4  # of the sample rate: slower modes have no alias that could be mistaken
@@ -46,15 +45,22 @@ _LEAST = float(np.finfo(np.float64).tiny)
 _SAME = 1e-5  # part of the error by which places that are as good may differ
 
 
-def lookalikes(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """Chromosomes (n_free,) in the ranges of which a fast mode is this one's or an alias of it."""
+def lookalikes(
+    objective: Objective, chromosome: FloatArray, *, narrow: bool = False
+) -> list[FloatArray]:
+    """Chromosomes (n_free,) in the ranges of which a fast mode is this one's or an alias of it.
+
+    narrow: whether a minimum lies in so narrow a valley that its errors are far less than all
+    others. Lags traded are worth a try whatever theirs, and what only keeps a mode is none.
+    """
     fastest, dt = _Modes(objective, chromosome), objective.records[0].dt
     swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
-    traded = _traded(fastest, chromosome)
-    starts = _harmless(objective, chromosome, [*swapped, *traded, *alike], _HARM)
+    traded, harm = _trades(fastest, chromosome), np.inf if narrow else _HARM
+    starts = _harmless(objective, chromosome, traded, harm)
+    starts += _harmless(objective, chromosome, [*swapped, *alike], _HARM)
     starts += _beyond_ends(objective, chromosome)
     for modes in (fastest, *fastest.others(2.0 * np.pi * _FASTEST_SEEN / dt)):
-        starts += [*_twins(modes), *_aliases(modes, dt)]
+        starts += [*([] if narrow else _twins(modes)), *_aliases(modes, dt)]
     return starts
 
 
@@ -63,7 +69,11 @@ def _harmless(
 ) -> list[FloatArray]:
     """Starts (n_free,) in the ranges whose error is less than so many times a chromosome's."""
     rows = np.stack([chromosome, *starts])
-    admitted = np.array([_within(objective.space, row) for row in rows])
+    # What is traded may come to zero, and a start that is no logarithm below it.
+    log = objective.space.log
+    coded = objective.space.encode(np.where(log, np.maximum(rows, _LEAST), rows))
+    lower, upper = objective.space.coded_bounds
+    admitted = np.all((coded >= lower) & (coded <= upper), axis=1)
     errors, _ = objective.evaluate(np.where(admitted[:, None], rows, chromosome))
     kept = admitted & (errors < harm * errors[0])
     return list(rows[1:][kept[1:]])
@@ -116,21 +126,7 @@ def _swaps(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
     return list(swapped)
 
 
-def trades(objective: Objective, chromosome: FloatArray) -> list[FloatArray]:
-    """Chromosomes (n_free,) in the ranges with the rates of two lags traded."""
-    space = objective.space
-    traded = _traded(_Modes(objective, chromosome), chromosome)
-    return [each for each in traded if _within(space, each)]
-
-
-def _within(space: SearchSpace, chromosome: FloatArray) -> bool:
-    # What is traded may come to zero, and a start that is no logarithm below it.
-    coded = space.encode(np.where(space.log, np.maximum(chromosome, _LEAST), chromosome))
-    lower, upper = space.coded_bounds
-    return bool(np.all((coded >= lower) & (coded <= upper)))
-
-
-def _traded(modes: _Modes, chromosome: FloatArray) -> list[FloatArray]:
+def _trades(modes: _Modes, chromosome: FloatArray) -> list[FloatArray]:
     """Chromosomes with the rates of two lags traded, each through one parameter.
 
     As those of an amplifier and of the winding behind it, which outputs hardly tell apart.
