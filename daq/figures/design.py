@@ -93,4 +93,4 @@ def _intervals(
     panel.set_ylim(len(labels) - 0.4, -0.6)
     style.logarithmic(panel.xaxis, np.append(widths, [t for t in targets if t is not None]))
     panel.grid(visible=False, axis="y")
-    panel.set_xlabel("half width of 95 % interval, before (open) and after [%]")
+    panel.set_xlabel("95 % half width, before (open) and after [%]")
