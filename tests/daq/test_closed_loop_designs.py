@@ -150,6 +150,7 @@ def test_a_loop_that_would_pass_a_limit_is_refused(free_shaft, limits, settings)
     assert tight.records(feedback, 1.0 / 800.0, model.nominal[None]) is None
 
 
+@pytest.mark.soak
 def test_a_design_for_a_free_shaft_writes_loops_that_run(tmp_path):
     asked = {
         "rig": "free_shaft.yaml", "model": MODEL, "time": "2.5 s", "run": "2.5 s",
