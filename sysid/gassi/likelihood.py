@@ -222,7 +222,8 @@ def _explored(
     optima = Optima(objective)
     for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
-    if sharpens and _is_sharp(objective, optima.ranked()[0]):
+    first = optima.ranked()[0]
+    if sharpens and _is_sharp(objective, first) and not _is_exact(first):
         return optima
     explored = None
     for _ in range(_EXPLORED if lookalike or beside else 1):
@@ -260,7 +261,14 @@ def _sharpened(objective: Objective, optima: Optima, watch: Watch | None) -> Opt
         for optimum in (best, *near):
             optima.add(_weighed(objective, optimum.chromosome, watch, least=least))
         last = least
-    return _with_lookalikes(objective, optima, watch, last) if last < LEAST_SHARE else optima
+    if last == LEAST_SHARE or _is_exact(optima.ranked()[0]):
+        return optima
+    return _with_lookalikes(objective, optima, watch, last)
+
+
+def _is_exact(optimum: Optimum) -> bool:
+    """Whether what is left is the simulation's own error: nothing is to be found beside it."""
+    return noiseless(optimum.objective, optimum.chromosome, optimum.rms)
 
 
 def _is_sharp(objective: Objective, optimum: Optimum, share: float = LEAST_SHARE) -> bool:
