@@ -167,8 +167,8 @@ def noise_free(model: ProcessModel, seeds: int) -> dict[str, Any]:
         seconds.append(duration)
         errors.append(estimator.error_)
         determined = estimator.uncertainty(record).determined()
-        strong = [e for e in determined if e.std is not None]
-        worst.append(max(abs(e.value / e.at(truth) - 1.0) for e in strong))
+        between = [e for e in determined if e.low is not None and e.high is not None]
+        worst.append(max(abs(e.value / e.at(truth) - 1.0) for e in between))
     return {
         "seeds": seeds,
         "within_0.1_percent": int(np.sum(np.array(worst) < 1e-3)),
