@@ -376,8 +376,7 @@ class GASSI(RecordEstimator):
         if self.estimated_starts_:
             minima = [likeliest.chromosome, *result.rivals]
             objective, minima = self._with_starts(objective, minima)
-            nowhere = replace(begun, chromosomes=())
-            result = fit(objective, minima, begun=nowhere, explored=True, felt=True)
+            result = fit(objective, minima, begun=replace(begun, chromosomes=()), explored=True)
         likeliest, self._rivals, self._ridge = result.optimum, result.rivals, result.ridge
         self._final_accuracy = likeliest.objective.simulator.accuracy
         self._slopes_accuracy = likeliest.objective.coarse.simulator.accuracy

@@ -57,6 +57,7 @@ _EXPLORED = 2  # minima whose lookalikes are descended from
 _SHARP_ROUNDS, _SHARP_ENDS = 4, 3
 _EXPLORED_BY_FILTER = 5  # the same by a filter
 _SHARPER = (1e-4, 1e-6)  # shares of the largest error that each counts for, one after another
+_NOISE = 1e-4  # of an output's largest value, that the noise of one of them is at least
 _BETTER = 1.0  # deviance by which one of them has to be better than the one before
 _COMPARED = 0.05  # deviance to which minima are compared: what decides is hundreds of times that
 
@@ -115,14 +116,13 @@ def fit_likelihood(
     process: FloatArray | None = None,
     begun: Begun | None = None,
     explored: bool = False,
-    felt: bool = False,
 ) -> Likeliest:
     """The likeliest of some minima (n_free,) of the mean RMSE and of their lookalikes.
 
     noise: how all of them are refitted in the end, where inputs or the process are noisy; by
     innovations, too, where free runs would not do. process: as of ``Innovations``. begun: where
     descents begin as well; if it is settled nothing looks like the minima. explored: whether these
-    have their lookalikes among them; felt: and what differs in what is hardly felt.
+    have their lookalikes among them.
     """
     objective, begun = accurate(objective, minima[0]), begun or Begun()
     # A filter begins at the minima of free runs, and does not end there; what looks like a minimum
@@ -130,7 +130,7 @@ def fit_likelihood(
     roughly = noise == "innovations"
     lookalike = not (explored or begun.is_settled or roughly)
     minima = minima if roughly else [*minima, *begun.chromosomes]
-    beside = not (begun.is_settled or roughly or felt)
+    beside = not (begun.is_settled or roughly)
     optima = _explored(
         objective, minima, watch, lookalike=lookalike, beside=beside, roughly=roughly,
         sharpens=noise is None,
@@ -223,7 +223,8 @@ def _explored(
     for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
     first = optima.ranked()[0]
-    if sharpens and _is_sharp(objective, first) and not _is_exact(first):
+    # What errs less than any noise everywhere may be a descent that stands.
+    if sharpens and _is_sharp(objective, first) and first.rms.max() > _NOISE:
         return optima
     explored = None
     for _ in range(_EXPLORED if lookalike or beside else 1):
