@@ -57,7 +57,8 @@ _EXPLORED = 2  # minima whose lookalikes are descended from
 _SHARP_ROUNDS, _SHARP_ENDS = 4, 3
 _EXPLORED_BY_FILTER = 5  # the same by a filter
 _SHARPER = (1e-4, 1e-6)  # shares of the largest error that each counts for, one after another
-_NOISE = 1e-4  # of an output's largest value, that the noise of one of them is at least
+_BY_FAR = 1e-3  # share of another's error, by which an output alone tells where minima are
+_NOISE = 1e-2  # of its largest value, from which what an output errs by is taken for noise
 _BETTER = 1.0  # deviance by which one of them has to be better than the one before
 _COMPARED = 0.05  # deviance to which minima are compared: what decides is hundreds of times that
 
@@ -223,8 +224,8 @@ def _explored(
     for minimum in minima if lookalike else minima[:1]:
         optima.add(_weighed(objective, minimum, watch, roughly=roughly))
     first = optima.ranked()[0]
-    # What errs less than any noise everywhere may be a descent that stands.
-    if sharpens and _is_sharp(objective, first) and first.rms.max() > _NOISE:
+    # A poor minimum explains an output far better than others by chance.
+    if sharpens and _is_sharp(objective, first, _BY_FAR) and first.rms.max() > _NOISE:
         return optima
     explored = None
     for _ in range(_EXPLORED if lookalike or beside else 1):
