@@ -7,7 +7,7 @@ from threading import Lock
 import numpy as np
 
 from daq.config.rig import RigConfig
-from daq.designs.closed_loop import COMMANDS, MEASURED, ClosedLoopRun, play
+from daq.designs.closed_loop import COMMANDS, MEASURED, ClosedLoopRun, places_of_commands, play
 from daq.designs.knowledge import expected_jitter, speed_noise
 from daq.errors import ConfigError
 from daq.experiment import Plan
@@ -84,7 +84,7 @@ class PlantBench:
         shared = [name for name in model.parameter_names if name in plant.parameter_names]
         self._from = [model.parameter_names.index(name) for name in shared]
         self._to = [plant.parameter_names.index(name) for name in shared]
-        self._commanded = [plant.input_names.index(name) for name in COMMANDS]
+        self._commanded = places_of_commands(plant)
         self._choosing = Lock()
         self._steps_of: dict[bytes, IntArray] = {}
 

@@ -18,6 +18,11 @@ MEASURED = ("current_motor", "current_brake", "torque", "theta", "omega")
 _THETA = MEASURED.index("theta")
 
 
+def places_of_commands(plant: ProcessModel) -> list[int]:
+    """Places of ``COMMANDS`` among a plant's inputs."""
+    return [plant.input_names.index(name) for name in COMMANDS]
+
+
 def feedback_of(experiment: ClosedLoop, planned: Plan) -> Feedback:
     """Commands (2,) [V] of an experiment's controller that answer what is ``MEASURED``, (5,).
 
@@ -84,7 +89,7 @@ class _Sensed:
     def __init__(self, plant: ProcessModel, count: float) -> None:
         names, self._count = plant.output_names, count
         self._places = [names.index(name) if name in names else len(names) for name in MEASURED]
-        self.commanded = [plant.input_names.index(name) for name in COMMANDS]
+        self.commanded = places_of_commands(plant)
         self._n_inputs = len(plant.inputs)
 
     def controller(self, feedback: Feedback) -> Answer:

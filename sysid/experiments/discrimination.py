@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -9,7 +10,13 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.bench import Bench, FreeRun
 from sysid.experiments.excitation import Excitation
-from sysid.experiments.experiment import FEW, ChosenRuns, designed_run, deviations_of
+from sysid.experiments.experiment import (
+    ChosenRuns,
+    designed_run,
+    deviations_of,
+    kept_by_all,
+    tried_with,
+)
 from sysid.experiments.feedback import Feedback
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
@@ -156,14 +163,9 @@ def discriminate(
             records.append(each[0])
         return records
 
-    def confirm(candidate: RunCandidate) -> bool:
-        inputs = candidate.excitation.signal(candidate.genes)
-        feedback = isinstance(inputs, Feedback)
-        return not feedback or logged(inputs, candidate.excitation.dt, checks) is not None
-
     def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
         inputs = excitation.signal(genes)
-        records = logged(inputs, excitation.dt, FEW if isinstance(inputs, Feedback) else checks)
+        records = logged(inputs, excitation.dt, tried_with(inputs, 1, checks))
         if records is None:
             return None
         answers = tournament.answers(records)
@@ -172,6 +174,7 @@ def discriminate(
         return tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
 
     aim = tournament.criterion()
+    confirm = partial(kept_by_all, lambda inputs, dt: logged(inputs, dt, checks))
     search = Search(excitations, evaluate, aim, rng, runs, workers, watch, confirm)
     search.scatter(candidates)
     begins = tournament.begins(tournament.likeliest(), starts)

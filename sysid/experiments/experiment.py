@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from sysid.uncertainty.ties import named_values
 # Runs are searched for by coarser simulations and few draws of the inputs' noise; of those chosen
 # it is told by what was asked for and by many. Times the accuracy, its end, draws.
 _COARSER, _COARSEST, _DRAWS = 10.0, 0.1, 96
-FEW = 4  # parameter vectors at least that a feedback is tried with, before it is chosen
+_FEW = 4  # parameter vectors at least that a feedback is tried with, before it is chosen
 
 
 @dataclass(frozen=True)
@@ -203,8 +204,7 @@ def design(
 
     def expected(by: Informant, excitation: Excitation, genes: FloatArray) -> FloatArray | None:
         inputs = excitation.signal(genes)
-        tried = vectors[: max(draws, FEW)] if isinstance(inputs, Feedback) else vectors
-        records = bench.records(inputs, excitation.dt, tried)
+        records = bench.records(inputs, excitation.dt, vectors[: tried_with(inputs, draws, checks)])
         if records is None:
             return None
         gained = _information(by, records[:draws], robust)
@@ -220,11 +220,6 @@ def design(
         phantoms.append(excitation.name)
         return None
 
-    def confirm(candidate: RunCandidate) -> bool:
-        inputs, dt = candidate.excitation.signal(candidate.genes), candidate.excitation.dt
-        feedback = isinstance(inputs, Feedback)
-        return not feedback or bench.records(inputs, dt, vectors) is not None
-
     def settled(candidate: RunCandidate) -> RunCandidate:
         gained = expected(exact, candidate.excitation, candidate.genes)
         return candidate if gained is None else replace(candidate, information=gained)
@@ -233,6 +228,7 @@ def design(
     gradients = relative_gradients(wanted, space, robust)
     of_information = criteria.Criterion(criterion, information, gradients, goals)
     workers = Workers(available_cores())
+    confirm = partial(kept_by_all, lambda inputs, dt: bench.records(inputs, dt, vectors))
     search = Search(excitations, evaluate, of_information, rng, runs, workers, watch, confirm)
     search.run(candidates, generations, offspring)
     search.settle(settled)
@@ -247,6 +243,23 @@ def design(
         refused=search.attempts - search.kept,
         phantoms=len(phantoms),
     )
+
+
+def tried_with(inputs: FloatArray | Feedback, draws: int, checks: int) -> int:
+    """Parameter vectors that a candidate is tried with: all, of a feedback few, which take long."""
+    return max(draws, _FEW) if isinstance(inputs, Feedback) else max(draws, checks)
+
+
+def kept_by_all(
+    records: Callable[[Feedback, float], object | None], candidate: RunCandidate
+) -> bool:
+    """Whether a candidate keeps limits with the vectors that it has not been tried with, too.
+
+    records: what all of them give, None where a limit is passed.
+    """
+    excitation = candidate.excitation
+    inputs = excitation.signal(candidate.genes)
+    return not isinstance(inputs, Feedback) or records(inputs, excitation.dt) is not None
 
 
 def designed_run(candidate: RunCandidate) -> DesignedRun:

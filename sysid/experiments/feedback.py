@@ -32,14 +32,14 @@ class Feedback:
     n_samples: int
     ahead: int = 1
 
-    def run(self, stepper: Stepper, start: FloatArray | None = None) -> tuple[FloatArray, ...]:
+    def run(self, stepper: Stepper) -> tuple[FloatArray, FloatArray]:
         """Inputs (n, n_inputs) and outputs (n, n_outputs) of a run, n at most ``n_samples``.
 
-        start: (n_states,), by default the model's. Raises ModelError for inputs of another number,
-        or that are not finite, and for a run of fewer than two samples.
+        Raises ModelError for inputs of another number, or that are not finite, and for a run of
+        fewer than two samples.
         """
         model, answer = stepper.model, self.begin()
-        state = np.array(model.initial_state if start is None else start, dtype=np.float64)
+        state = model.initial_state.astype(np.float64)
         inputs = np.zeros((self.n_samples, len(model.inputs)))
         outputs = np.empty((self.n_samples, len(model.outputs)))
         held = np.zeros((2, len(model.inputs)))

@@ -170,9 +170,9 @@ class Search:
         while not settled.issuperset(self.chosen):
             self.revise(revised, sorted({*self.chosen} - settled))
             settled.update(self.chosen)
-            self._greedily(np.array([candidate.information for candidate in self.pool]))
+            self._greedily(self._stack)
             while not self._confirmed():
-                self._greedily(np.array([candidate.information for candidate in self.pool]))
+                self._greedily(self._stack)
 
     def choose(self) -> None:
         """The best set that greed and exchanges lead to, of candidates that are confirmed.
@@ -180,7 +180,7 @@ class Search:
         Raises ModelError where none of them is.
         """
         while True:
-            stack = np.array([candidate.information for candidate in self.pool])
+            stack = self._stack
             self._greedily(stack)
             for _ in range(_ROUNDS):
                 exchanged = [self._exchange(stack, place) for place in range(len(self.chosen))]
@@ -189,20 +189,20 @@ class Search:
             if self._confirmed():
                 return
 
+    @property
+    def _stack(self) -> FloatArray:
+        """Information of all candidates, (n_pool, n_draws, n_free, n_free)."""
+        return np.array([candidate.information for candidate in self.pool])
+
     def _confirmed(self) -> bool:
         """Whether all that are chosen keep all limits; those that do not are out of it."""
         if self.confirm is None:
             return True
         doubtful = sorted({*self.chosen} - self._sure)
-        kept = dict.fromkeys(doubtful, False)
-
-        def ask(place: int) -> None:
-            kept[place] = self.confirm is None or self.confirm(self.pool[place])
-
-        self.workers.each(ask, doubtful)
-        refused = {place for place in doubtful if not kept[place]}
-        self._sure.update(kept.keys() - refused)
-        self._out += sorted(refused)
+        kept = self.workers.results(self.confirm, [self.pool[place] for place in doubtful])
+        refused = [place for place, keeps in zip(doubtful, kept, strict=True) if not keeps]
+        self._sure.update(set(doubtful) - set(refused))
+        self._out += refused
         self.kept -= len(refused)
         if len(self._out) == len(self.pool):
             raise ModelError(_NONE.format(len(self.pool)))

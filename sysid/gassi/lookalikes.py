@@ -55,8 +55,9 @@ def lookalikes(
     """
     fastest, dt = _Modes(objective, chromosome), objective.records[0].dt
     swapped, alike = _swaps(objective, chromosome), alike_responses(objective, chromosome)
-    traded = _trades(fastest, chromosome)
-    starts = _harmless(objective, chromosome, traded, np.inf) if narrow else []
+    traded, starts = _trades(fastest, chromosome), []
+    if narrow:
+        traded, starts = [], _harmless(objective, chromosome, traded, np.inf)
     starts += _harmless(objective, chromosome, [*swapped, *traded, *alike], _HARM)
     starts += _beyond_ends(objective, chromosome)
     for modes in (fastest, *fastest.others(2.0 * np.pi * _FASTEST_SEEN / dt)):

@@ -22,9 +22,7 @@ _STEPS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)  # standard deviations, outwar
 _ITERATIONS = 20
 # A parameter without a standard deviation is moved by parts of its range.
 _BLIND_SHARE = 0.05
-_FAR_OUT = (
-    4.0  # times the level, from where it does not matter by how much more a place explains less
-)
+_FAR_OUT = 4.0  # times the level, from where by how much less a place explains does not matter
 _RESOLUTION = 0.02  # of the statistic, to which refits go
 _REFITS, _NEAR = 20, 0.1  # of one end, until the root of the statistic is so near its level,
 _GAP = 0.02  # or two fits on both sides of it so near each other, in parts of the way there
@@ -122,8 +120,10 @@ def traced(
 
     fits: is given all that were made on the way.
     """
+    if not searches:
+        return []
     results: dict[int, _Result] = {}
-    base = _Base(searches[0][0]) if searches else None
+    base = _Base(searches[0][0])
     answers: dict[int, Fit | None] = dict.fromkeys(range(len(searches)))
     while answers:
         wanted: dict[int, Wanted] = {}
@@ -132,7 +132,7 @@ def traced(
                 wanted[i] = searches[i][1].send(answer)  # type: ignore[arg-type]  # None begins it
             except StopIteration as end:
                 results[i] = end.value
-        if not wanted or base is None:
+        if not wanted:
             break
         made = base.fitted([(searches[i][0], task) for i, task in wanted.items()])
         answers = dict(zip(wanted, made, strict=True))
