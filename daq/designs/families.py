@@ -79,7 +79,10 @@ def families_of(
             }
             families[name] = ProtocolFamily(protocol, family, common)
         elif question.protocols:
-            problem = f"protocol {name} has no settings that a design may choose"
+            problem = (
+                f"protocol {name} has no settings that a design may choose on this rig, in runs of "
+                f"{frame.seconds:g} s"
+            )
             raise file.error(
                 ("protocols", k), problem, f"known are {', '.join(with_family(frame))}"
             )
