@@ -156,18 +156,21 @@ class RecordSimulator:
             todo = todo[again]
         return population
 
-    def steps_needed(self, parameters: FloatArray) -> IntArray:
+    def steps_needed(self, parameters: FloatArray, starts: FloatArray | None = None) -> IntArray:
         """Integration steps per sample that each needs, (n,), also beyond what there may be.
 
-        Those that were asked for lately are known: a fit begins where another ended.
+        starts: (n, n_states) or (1, n_states), default the record's own; where something is stiff
+        hangs on them. Those that were asked for lately are known: a fit begins where another ended.
         """
-        keys = [row.tobytes() for row in parameters]
+        from_starts = self._start[None] if starts is None else starts
+        from_starts = np.broadcast_to(from_starts, (len(parameters), from_starts.shape[1]))
+        keys = [row.tobytes() for row in np.hstack([parameters, from_starts])]
         unknown = [i for i, key in enumerate(keys) if key not in self._steps_of]
         if unknown:
             if len(self._steps_of) > _MOST_KNOWN:
                 self._steps_of.clear()
                 unknown = list(range(len(keys)))
-            steps = self.population(parameters[unknown]).n_steps.tolist()
+            steps = self.population(parameters[unknown], from_starts[unknown]).n_steps.tolist()
             self._steps_of.update(zip([keys[i] for i in unknown], steps, strict=True))
         return np.array([self._steps_of[key] for key in keys], dtype=np.int64)
 

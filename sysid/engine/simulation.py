@@ -400,24 +400,28 @@ class BatchSimulator:
         self._workers.each(copy, copies)
         return Residuals(values, sse, excess)
 
-    def steps_needed(self, parameters: FloatArray, records: Sequence[Dataset]) -> IntArray:
-        """Integration steps per sample that each parameter vector needs, (n, n_records)."""
+    def steps_needed(
+        self,
+        parameters: FloatArray,
+        records: Sequence[Dataset],
+        starts: Sequence[FloatArray | None],
+    ) -> IntArray:
+        """Integration steps per sample that each parameter vector needs, (n, n_records).
 
-        def needed(record: Dataset) -> IntArray:
-            return self.steps_of_each(parameters, record)
+        starts: as those of ``errors``.
+        """
 
-        return np.stack(self._workers.results(needed, records), axis=1)
+        def needed(place: int) -> IntArray:
+            return self.steps_of_each(parameters, records[place], starts[place])
+
+        return np.stack(self._workers.results(needed, range(len(records))), axis=1)
 
     def steps_of_each(
         self, parameters: FloatArray, record: Dataset, starts: FloatArray | None = None
     ) -> IntArray:
         """Integration steps per sample that each parameter vector needs, (n,)."""
         parameters = self._check(parameters, [record])
-        simulator = self._on(record)
-        if starts is None:
-            steps = simulator.steps_needed(parameters)
-        else:
-            steps = simulator.population(parameters, starts).n_steps
+        steps = self._on(record).steps_needed(parameters, starts)
         return np.minimum(steps, self.max_steps)
 
     def _on(self, record: Dataset, scale: FloatArray | None = None) -> RecordSimulator:

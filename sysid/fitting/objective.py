@@ -24,6 +24,7 @@ from sysid.engine.compiler import is_differentiable
 from sysid.engine.simulation import BatchResult, BatchSimulator, Residuals
 from sysid.fitting.slopes import SlopeBlock, Slopes
 from sysid.problem.data import Dataset, output_scale
+from sysid.problem.metrics import FITTED
 from sysid.problem.model import ModelError
 from sysid.problem.space import SearchSpace
 
@@ -292,7 +293,7 @@ class Objective:
         """Integration steps per sample that each chromosome needs, (n, n_records)."""
         vectors = self.space.full(chromosomes)
         self._counter[0] += len(vectors)
-        return self.simulator.steps_needed(vectors, self.records)
+        return self.simulator.steps_needed(vectors, self.records, self._starts(chromosomes))
 
     def error_of(self, rms: FloatArray) -> FloatArray:
         """The error E of outputs' errors r (n, n_outputs), (n,), infinite where one failed."""
@@ -304,6 +305,21 @@ class Objective:
         """The same of ``smoothed`` outputs' errors, (n,)."""
         with np.errstate(over="ignore", invalid="ignore"):
             return self.error_of(smoothed(rms, floor))
+
+    def explains_little(self, rms: FloatArray) -> bool:
+        """Whether errors (n_outputs,) are half of what each output deviates from its mean.
+
+        Where a model explains so little minima are many and none is the plant's.
+        """
+        squares = np.zeros(len(self.weights))
+        for record, scale in zip(self.records, self.scales, strict=True):
+            seen = np.isfinite(record.outputs)
+            outputs = np.where(seen, record.outputs, 0.0)
+            away = outputs - outputs.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+            squares += np.sum(np.where(seen, away / scale, 0.0) ** 2, axis=0)
+        counted = self.weights > 0.0
+        least = (1.0 - FITTED / 100.0) * self._roots(squares)
+        return bool(np.all(rms[counted] > least[counted]))
 
     @property
     def n_residuals(self) -> int:

@@ -230,8 +230,11 @@ def _explored(
     explored = None
     for _ in range(_EXPLORED if lookalike or beside else 1):
         best = optima.ranked()[0]
-        if explored is not None and optima.deviance(explored, best) < _BETTER:
-            break  # nothing better was found around it
+        if explored is not None and (
+            optima.deviance(explored, best) < _BETTER  # nothing better was found around it
+            or best.objective.explains_little(best.rms)
+        ):
+            break
         starts = [] if lookalike or explored else [*minima[1:]]
         starts += lookalikes(best.objective, best.chromosome) if lookalike else []
         starts += hardly_felt(best.objective, best.chromosome) if beside else []

@@ -36,12 +36,16 @@ _PLAIN_STATE = ("reserve", "polishing", "polished", "best", "error", "feasible")
 
 @dataclass(frozen=True)
 class Minimum:
-    """End of a descent, its error and the outputs' (n_outputs,), and how often it was varied."""
+    """Ends of descents, its error and the outputs' (n_outputs,).
+
+    varied: how often new starts were sought around it. met: by how many descents.
+    """
 
     at: FloatArray
     error: float
     rms: FloatArray
     varied: int = 0
+    met: int = 1
 
 
 @dataclass(eq=False)
@@ -141,9 +145,23 @@ class LocalSearch:
     def _only_polishing_left(self) -> bool:
         if self.error <= refinement.ROUNDING or not (self.descents or self.minima):
             return True
+        if not self.descents and self._all_are_met():
+            return True
         going_on = self.descents or self.dips
         variation_cost = self.n_varied * self.points + 2 * self.iteration_cost
         return self.left < self.reserve + (self.iteration_cost if going_on else variation_cost)
+
+    def _all_are_met(self) -> bool:
+        """Whether no more minima are expected than descents have ended in.
+
+        Of n descents that ended in w minima, w (n - 1) / (n - w - 2) are expected in all (Boender
+        and Rinnooy Kan, "Bayesian stopping rules for multistart global optimization methods",
+        Mathematical Programming 37, 1987). That is of starts at random; these lie around minima,
+        so that each of them has to have been varied in both ways.
+        """
+        w, n = len(self.minima), sum(minimum.met for minimum in self.minima)
+        varied = all(minimum.varied >= 2 for minimum in self.minima)
+        return varied and n > w + 2 and w * (n - 1) < (w + 0.5) * (n - w - 2)
 
     def _polish(self) -> None:
         (descent,) = self.descents = refinement.advance(self.objective, self.descents)
@@ -196,9 +214,11 @@ class LocalSearch:
         if not (np.isfinite(error) and np.all(np.isfinite(rms))):
             return
         self._offer(point)
-        alike = (np.allclose(rms, m.rms, rtol=_SAME, atol=_SAME * error) for m in self.minima)
-        if not any(alike):
-            self.minima.append(Minimum(at, error, rms))
+        for place, minimum in enumerate(self.minima):
+            if np.allclose(rms, minimum.rms, rtol=_SAME, atol=_SAME * error):
+                self.minima[place] = replace(minimum, met=minimum.met + 1)
+                return
+        self.minima.append(Minimum(at, error, rms))
 
     def _vary(self) -> None:
         """New starts around the best of the minima that have been varied least."""

@@ -22,7 +22,7 @@ from sysid.judging.residual_tests import ResidualTest, residual_test
 from sysid.judging.starts import Starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import DataFault
-from sysid.problem.metrics import Metrics, evaluate, mean_known
+from sysid.problem.metrics import FITTED, Metrics, evaluate, mean_known
 from sysid.problem.model import ProcessModel
 from sysid.uncertainty import Uncertainty
 from sysid.uncertainty.colour import SUCCESSIVE
@@ -35,7 +35,6 @@ _HARDLY_WORSE, _FAR_WORSE = 1.3, 2.0
 # Of an output's deviation, below which an error, or what is left of an input, is nothing to mend;
 # and below which it says nothing of parameters either.
 _SMALL, _TRACE = 0.01, 5e-3
-FITTED = 50.0  # fit [%] below which a model explains little
 # Correlation with an input below which what is left is found in long records, but is nothing to
 # mend: one per cent of the residuals' variance.
 _NOTICEABLE = 0.1

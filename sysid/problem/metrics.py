@@ -11,6 +11,8 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
 
+FITTED = 50.0  # fit [%] below which a model explains little
+
 
 def rmse(
     measured: FloatArray, simulated: FloatArray, scale: FloatArray | float = 1.0

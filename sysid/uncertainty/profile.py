@@ -24,7 +24,9 @@ _ITERATIONS = 20
 _BLIND_SHARE = 0.05
 _FAR_OUT = 4.0  # times the level, from where by how much less a place explains does not matter
 _RESOLUTION = 0.02  # of the statistic, to which refits go
-_REFITS, _NEAR = 20, 0.1  # of one end, until the root of the statistic is so near its level,
+# Refits of one end, few where a model explains little and none of its minima is the plant's,
+_REFITS, _FEW = 20, 4
+_NEAR = 0.1  # until the root of the statistic is so near its level,
 _GAP = 0.02  # or two fits on both sides of it so near each other, in parts of the way there
 # Times the distance, that the next point may be away at most, and where a valley has branches.
 _LEAP, _CAREFUL = 8.0, 1.5
@@ -264,7 +266,7 @@ class Tracer:
             return None
         beyond = halve = False
         leap = _LEAP
-        for _ in range(_REFITS):
+        for _ in range(_FEW if self.local.explains_little else _REFITS):
             place = self._next(sign, end, inside, outside, halve=halve, leap=leap)
             fit = yield self._wanted(place, fits)
             if fit.alone and fit.statistic <= Z95**2:

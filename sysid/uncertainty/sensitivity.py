@@ -76,6 +76,12 @@ class Sensitivity:
         return float(self.criterion.evaluate(self.chromosome[None])[0][0])
 
     @cached_property
+    def explains_little(self) -> bool:
+        """As of the criterion's ``explains_little``."""
+        rms = np.sqrt(np.sum(self.residual**2, axis=0) / np.maximum(self.criterion.counts, 1))
+        return self.criterion.explains_little(rms)
+
+    @cached_property
     def bends(self) -> FloatArray:
         """As of ``Innovations.bends``; of no draws without a filter."""
         if filters(self.criterion):

@@ -167,7 +167,7 @@ class Formula:
     def steps_of_each(self, vectors, record):
         return np.ones(len(vectors), dtype=int)
 
-    def steps_needed(self, vectors, records):
+    def steps_needed(self, vectors, records, starts):
         return np.stack([self.steps_of_each(vectors, record) for record in records], axis=1)
 
     def trajectories(self, vectors, record, n_steps=None, starts=None):
@@ -183,12 +183,12 @@ class Formula:
             found[:, ~np.isfinite(record.outputs)] = 0.0
             parts.append(found)
         sse = np.stack([np.sum(part**2, axis=1) for part in parts], axis=1)
-        needed = self.steps_needed(vectors, records)
+        needed = self.steps_needed(vectors, records, starts)
         values = np.moveaxis(np.concatenate(parts, axis=1), 0, 2).copy()
         return Residuals(values, sse, needed / n_steps)
 
     def errors(self, vectors, records, scales, starts):
-        needed = self.steps_needed(vectors, records)
+        needed = self.steps_needed(vectors, records, starts)
         sse = self.residuals(vectors, records, scales, needed, starts).sse
         return BatchResult(sse, np.zeros(len(vectors), dtype=int), needed.sum(axis=1))
 

@@ -95,19 +95,60 @@ def test_jumps_leave_a_minimum_that_a_descent_cannot(seed):
     assert target.simulations <= before + 6000
 
 
-def test_the_budget_is_kept_and_the_end_is_a_minimum():
+def noisy_motor_record():
     noise = np.random.default_rng(0).normal(0.0, 0.02, (200, 2))
     clean = motor_record()
-    record = Dataset(
+    return Dataset(
         clean.inputs, clean.outputs + noise * np.abs(clean.outputs).max(axis=0), clean.dt
     )
-    fitted = GASSI(motor(), population=100, generations=20, criterion="error").fit(record)
-    assert 0.85 * 2000 < fitted.n_simulations_ <= 2000
-    assert len(fitted.history_) in (18, 19, 20)
+
+
+def test_the_budget_is_kept_and_the_end_is_a_minimum():
+    record = noisy_motor_record()
+    fitted = GASSI(motor(), population=100, generations=10, criterion="error").fit(record)
+    assert 0.7 * 1000 < fitted.n_simulations_ <= 1000
+    assert len(fitted.history_) in (8, 9, 10)
     assert np.all(np.diff(fitted.history_) <= 1e-12)
     assert fitted.history_[-1] == fitted.error_
     again = refine(objective(motor(), record), fitted.chromosome_)
     assert fitted.error_ == pytest.approx(again.error, rel=1e-6)
+
+
+def test_a_search_ends_when_no_more_minima_are_expected():
+    record = noisy_motor_record()
+    fitted = GASSI(motor(), population=300, generations=40, criterion="error").fit(record)
+    assert fitted.n_simulations_ < 0.5 * 12000
+    again = refine(objective(motor(), record), fitted.chromosome_)
+    assert fitted.error_ == pytest.approx(again.error, rel=1e-6)
+
+
+def met(*times, varied=2):
+    """A search that is between descents, some of which have ended in minima so many times."""
+    target = objective(lag(), Dataset(np.ones(30), np.linspace(0.0, 1.0, 30), DT))
+    rng = np.random.default_rng(0)
+    local = LocalSearch(target, np.array([[1.0, 0.1]]), 10**6, 300, rng)
+    local.descents, local.error = [], 1.0
+    local.minima = [
+        Minimum(np.array([0.0, 0.0]), 1.0, np.array([1.0]), varied=varied, met=n) for n in times
+    ]
+    return local
+
+
+@pytest.mark.parametrize(
+    ("times", "most"),
+    # w (n - 1) / (n - w - 2) < w + 1/2 of n descents that ended in w minima, by hand
+    [((8,), True), ((7,), False), ((16, 1), True), ((15, 1), False)],
+)
+def test_descents_tell_how_many_minima_there_are(times, most):
+    local = met(*times)
+    local.step()
+    assert local.polishing == most
+
+
+def test_nothing_is_over_before_each_minimum_has_been_varied_both_ways():
+    local = met(40, varied=1)
+    local.step()
+    assert not local.polishing
 
 
 def test_a_budget_too_small_is_exceeded_by_one_descent_to_the_minimum():
