@@ -311,15 +311,18 @@ class Objective:
 
         Where a model explains so little minima are many and none is the plant's.
         """
+        return self.unexplained(rms) > 1.0 - FITTED / 100.0
+
+    def unexplained(self, rms: FloatArray) -> float:
+        """Errors (n_outputs,) in parts of what the outputs deviate from their means, the least."""
         squares = np.zeros(len(self.weights))
         for record, scale in zip(self.records, self.scales, strict=True):
             seen = np.isfinite(record.outputs)
             outputs = np.where(seen, record.outputs, 0.0)
             away = outputs - outputs.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
             squares += np.sum(np.where(seen, away / scale, 0.0) ** 2, axis=0)
-        counted = self.weights > 0.0
-        least = (1.0 - FITTED / 100.0) * self._roots(squares)
-        return bool(np.all(rms[counted] > least[counted]))
+        counted = (self.weights > 0.0) & (squares > 0.0)
+        return float(np.min(rms[counted] / self._roots(squares)[counted], initial=np.inf))
 
     @property
     def n_residuals(self) -> int:

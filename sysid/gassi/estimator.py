@@ -24,7 +24,7 @@ from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.first_samples import noticed_starts, with_starts
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import Begun, NoisyInputs, fit_likelihood, promising
-from sysid.gassi.nudged import nudged
+from sysid.gassi.nudged import let_go, nudged
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
 from sysid.problem.earlier_minima import EarlierMinima
@@ -57,6 +57,7 @@ _VERY_LONG = 8
 # Minima that a search by parts does not tell apart and that are fitted to their end: to all
 # samples, or for less to the parts themselves.
 _ALIKE_BY_ALL, _ALIKE_BY_PARTS = 3, 10
+_FAR_OFF = 0.1  # of an output's deviation, that is no noise of a precise measurement
 
 # Not compared with a checkpoint's: they do not decide the result, or it holds them otherwise.
 _NOT_COMPARED = ("model", "threads", "dt")
@@ -266,6 +267,8 @@ class GASSI(RecordEstimator):
         self.stopped_ = self._search(run, checkpoints, notify)
         self._set_run(run)
         try:
+            if self.stopped_ != "interrupted" and run.local is not None and self._cut is None:
+                self._search_held(run, searched, preset, notify)
             self._conclude(run, objective, notify, earlier)
         except KeyboardInterrupt:
             self.stopped_ = "interrupted"
@@ -292,6 +295,34 @@ class GASSI(RecordEstimator):
             if checkpoints is not None:
                 checkpoints.flush()
         return "converged" if run.search.converged else "generations"
+
+    def _search_held(
+        self,
+        run: SearchRun,
+        objective: Objective,
+        preset: Preset,
+        notify: Callable[[Progress], None],
+    ) -> None:
+        """Search by runs that measurements hold, too, where the best free run is far from them.
+
+        objective: that of the search, over the parameters alone.
+        """
+        free, best = run.objective, run.best
+        assert run.local is not None and best is not None
+        if free.unexplained(free.rms(best.chromosome[None])[0]) < _FAR_OFF:
+            return
+        held = nudged(objective.simulator, objective.records)
+        if held is None:
+            return
+        simulator, records = held
+        search = self._search_run(objective.simulated_by(simulator).on(records), preset, None)
+        while not search.done:
+            search.step()
+            notify(Progress("refine", len(search.history), self.generations, self.error_))
+        for end in let_go(free, search.minima()):
+            at = free.space.encode(end.chromosome)
+            run.local.add(Point(at, end.error, end.rms))
+        self._set_run(run)
 
     def _conclude(
         self,
@@ -576,9 +607,10 @@ class GASSI(RecordEstimator):
     def _searched(self, objective: Objective) -> Objective:
         """An objective of the records as that of what the search goes by."""
         excerpt = self.excerpt_
-        held = None if self._cut is None else nudged(objective.simulator, self._cut)
-        if held is not None:
-            simulator, excerpt = held
+        held = None if self._cut is None else nudged(objective.simulator, self._cut.records)
+        if held is not None and excerpt is not None:
+            simulator, records = held
+            excerpt = replace(excerpt, records=tuple(records), cut=False)
             objective = objective.simulated_by(simulator)
         return objective if excerpt is None else excerpt.among(objective)
 
@@ -709,7 +741,7 @@ class GASSI(RecordEstimator):
             # So few simulations leave the local search nothing but its last descent.
             population, generations, chromosome = 2, 1, begun[0]
         search = GeneticSearch(
-            self.space_, preset, population, generations, rng, *rule, begin=chromosome
+            objective.space, preset, population, generations, rng, *rule, begin=chromosome
         )
         return SearchRun(objective, search, self.generations, self.criterion_ != "error", begun)
 

@@ -177,13 +177,13 @@ class LocalSearch:
             # What remains to be smoothed matters to the last digits only.
             ended = descent.finished or descent.iterations >= _MOST_ITERATIONS
             if ended or descent.smoothing > 0:
-                self._add(descent.point)
+                self.add(descent.point)
             else:
                 live.append(descent)
         least = min([self.error, *(descent.point.error for descent in live)])
         self.descents = [descent for descent in live if not _hopeless(descent, least)]
         if not (self.descents or self.minima):
-            self._add(Point(self.best, self.error))
+            self.add(Point(self.best, self.error))
 
     def _take(self, descent: Descent) -> None:
         """Offer the point that a descent has reached for sure."""
@@ -207,7 +207,7 @@ class LocalSearch:
         rms: FloatArray = self.objective.rms(self.objective.space.decode(at[None]))[0]
         return rms
 
-    def _add(self, point: Point) -> None:
+    def add(self, point: Point) -> None:
         """Add a minimum, unless the outputs err as in another; flat directions tell nothing."""
         at, error, rms = point.at, point.error, point.accurate_rms
         rms = self._rms(at) if rms is None else rms

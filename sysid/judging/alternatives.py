@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from sysid.judging.comparison import Candidate, Comparison, compare
 from sysid.judging.findings import Finding, description, moves_of
 from sysid.judging.suspects import input_noise, variants_of
 from sysid.problem.data import Dataset
+from sysid.problem.earlier_minima import EarlierMinima
 from sysid.problem.metrics import fit_percent, mean_known
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.terms import AddedTerm, with_terms
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 # A difference of BIC above this is very strong evidence (Kass & Raftery, "Bayes factors",
 # J. American Statistical Association 90, 1995).
 _STRONG = 10.0
+_SEARCHED = 0.25  # of a search's simulations, which a variant is given
 
 
 @dataclass(frozen=True)
@@ -86,12 +89,17 @@ def best_alternative(
 
 
 def _fitted(estimator: GASSI, model: ProcessModel, training: Sequence[Dataset]) -> GASSI | None:
-    """A model fitted with the settings of an estimator; None where no simulation succeeds."""
+    """A model fitted with the settings of an estimator; None where no simulation succeeds.
+
+    It begins where the estimator's ended as well, so that a part of the simulations will do.
+    """
     from sysid.gassi import GASSI
 
     settings = {**estimator.get_params(deep=False), "model": model}
+    settings["generations"] = math.ceil(_SEARCHED * estimator.generations)
+    earlier = EarlierMinima([estimator.parameters_])
     try:
-        return GASSI(**settings).fit(list(training))
+        return GASSI(**settings).fit(list(training), earlier=earlier)
     except ModelError:
         return None
 

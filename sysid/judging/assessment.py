@@ -239,8 +239,9 @@ def _prediction(
     if voided:
         light += voided
     elif not validation:
-        grave += _poor_fits(model, training)
         light.append("No data were held back for validation: the errors are those of the fit.")
+    if not grave:
+        grave += _poor_fits(model, training)
     light += _input_traces(model, validation or training)
     light += _failing_starts((*training, *validation))
     return Statement.of(grave, light, _praise(model, validation))

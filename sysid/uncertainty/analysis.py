@@ -36,6 +36,8 @@ _DRAWS = 20_000  # of all quantities together
 _ALIKE = 0.05  # rivals closer than this are one
 _NOT_BY_CHANCE = 3.3  # deviations: one in a thousand
 _SIDES = (-1.0, 1.0)
+_AT_ONCE = 15  # ends of intervals that are simulated side by side
+_UNLIKE = 5.0  # times what slopes foretell at an interval's end, from where they are no guide
 _ROUNDS = 3  # of searches that go on from what others came to
 _FAR = 0.1  # of the way to an end, by which such a place is beyond it
 _LEAST = 1e-12  # variance, and share of others', of what a covariance holds for known exactly
@@ -193,7 +195,13 @@ def uncertainty(
         drafts = [d if j in profiled else replace(d, tracer=None) for j, d in enumerate(drafts)]
     tied = list(analysis.ambiguities())
     combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
-    settled = analysis.opened(analysis.settled([*drafts, *combined]))
+    confirmed = analysis.confirmed([*drafts, *combined])
+    if objective.free_run is objective and any(draft.is_refused for draft in confirmed):
+        # Differences may have been too far for a valley so narrow.
+        exact = objective.with_exact_slopes()
+        if exact.exact_slopes and not objective.exact_slopes:
+            return uncertainty(exact, chromosome, rivals, ridge, structure, profiled)
+    settled = analysis.opened(analysis.settled(confirmed))
     harmless = analysis.harmless_ends(settled, profiled)
     whole = (_with_bottoms(estimate, bottoms) for estimate in settled)
     estimates = iter(map(judged, whole))
@@ -284,13 +292,14 @@ class _Draft:
     """An estimate; without a deviation, unless it is tied, one whose ends its profile tells.
 
     traced: whether they are that profile's. place: of a parameter, a part of whose range may be
-    one where simulations fail.
+    one where simulations fail. is_refused: whether simulations have refused its ends by slopes.
     """
 
     estimate: Estimate
     tracer: Tracer | None = None
     place: int | None = None
     traced: bool = False
+    is_refused: bool = False
 
     def searches(self, fits: Sequence[Fit]) -> dict[float, Fit | None]:
         """Sides on which the profile is to be searched, and the fits to go on from."""
@@ -645,6 +654,57 @@ class _Analysis:
             return False
         step, deviation = gradient @ self.free.newton_step, self.free.deviation(gradient)
         return bool(abs(step) > Z95 * deviation)
+
+    def confirmed(self, drafts: Sequence[_Draft]) -> list[_Draft]:
+        """Drafts, without deviations that simulations refuse.
+
+        At the ends of an interval by slopes, all else following as slopes say, residuals are to
+        have changed about as these foretell, if they are a guide that far.
+        """
+        if self.local.criterion is not self.objective:  # of which the slopes are not
+            return [*drafts]
+        ends = [self._ends_by_slopes(draft) for draft in drafts]
+        points = [end for each in ends for end in each]
+        parts = [
+            self._as_foretold(points[k : k + _AT_ONCE]) for k in range(0, len(points), _AT_ONCE)
+        ]
+        shares = iter(np.concatenate([np.zeros(0), *parts]))
+
+        def judged(draft: _Draft, n_ends: int) -> _Draft:
+            at_ends = [next(shares) for _ in range(n_ends)]
+            if all(1.0 / _UNLIKE < share < _UNLIKE for share in at_ends):
+                return draft
+            estimate = replace(draft.estimate, std=None, low=None, high=None)
+            return replace(draft, estimate=estimate, is_refused=True)
+
+        return [judged(draft, len(each)) for draft, each in zip(drafts, ends, strict=True)]
+
+    def _as_foretold(self, points: Sequence[FloatArray]) -> FloatArray:
+        """Sums of squares by which residuals change, in parts of what slopes foretell, (n,)."""
+        local = self.local
+        rows = self.space.decode(np.stack([self.coded, *points]))
+        values = self.objective.residuals(rows, local.steps).values
+        weight = self.objective.least_squares_weights(local.residual)[:, None]
+        changes = np.sum(weight * (values[..., 1:] - values[..., :1]) ** 2, axis=(0, 1))
+        steps = np.stack(points, axis=1) - self.coded[:, None]
+        shares: FloatArray = changes / np.sum(weight * (local.slopes @ steps) ** 2, axis=(0, 1))
+        return shares
+
+    def _ends_by_slopes(self, draft: _Draft) -> list[FloatArray]:
+        """Search coordinates (n_free,) of an interval's ends in the ranges, if slopes have any.
+
+        What stands on an end of its range is no part of the way there.
+        """
+        if draft.tracer is None or draft.estimate.std is None:
+            return []
+        gradient = draft.tracer.gradient
+        along = self.covariance.curvature @ gradient
+        far = Z95 * self.covariance.deviation(gradient) / float(gradient @ along)
+        lower, upper = self.space.coded_bounds
+        if np.any(along[self.on_bound]):
+            return []
+        ends = [self.coded + sign * far * along for sign in _SIDES]
+        return [end for end in ends if np.all((end >= lower) & (end <= upper))]
 
     def settled(self, drafts: Sequence[_Draft]) -> list[Estimate]:
         """Estimates with the ends that profiles tell.

@@ -214,7 +214,7 @@ class Tracer:
         gradient: FloatArray,
         quantity: Profiled,
     ) -> None:
-        self.local, self.quantity = local, quantity
+        self.local, self.quantity, self.gradient = local, quantity, gradient
         self.start = local.objective.space.encode(local.chromosome)
         self.objective = objective = local.criterion
         self.centre = quantity.at(self.start)

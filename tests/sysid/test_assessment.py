@@ -118,6 +118,14 @@ def test_an_output_that_is_hardly_explained_is_poor():
     assert verdict(validation=[result(2, (0.6, NOISE))]).reasons == found.reasons
 
 
+def test_what_is_hardly_explained_where_it_was_fitted_is_poor_whatever_validation_says():
+    found = verdict([result(1, (0.6, NOISE))], [result(2)])
+    assert found.trust == "poor"
+    assert found.predicted.reasons == (
+        "speed is explained poorly even on the training data (fit 36 %).",
+    )
+
+
 @pytest.mark.parametrize(
     "ratio, trust",
     [(0.3, "good"), (1.2, "good"), (1.45, "limited"), (1.9, "limited"), (2.2, "poor")],

@@ -231,10 +231,10 @@ def test_what_is_measured_with_noise_is_not_held_to_it(very_long_record):
     noise = 0.2 * rng.standard_normal(very_long_record.outputs.shape)
     noisy = replace(very_long_record, outputs=very_long_record.outputs + noise)
     calibrated = replace(very_long_record, output_noise=np.array([0.01]))
-    held, driven = nudged(simulator, Excerpt.of([very_long_record], 4096))
-    assert len(held.model.inputs) == 2 and driven.records[0].inputs.shape[1] == 2
+    held, (driven,) = nudged(simulator, [very_long_record])
+    assert len(held.model.inputs) == driven.inputs.shape[1] == 3
     for record in (noisy, calibrated):
-        assert nudged(simulator, Excerpt.of([record], 4096)) is None
+        assert nudged(simulator, [record]) is None
 
 
 def test_a_part_whose_speed_is_a_mean_before_it_starts_as_the_fit_wants():

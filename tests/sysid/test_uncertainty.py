@@ -497,6 +497,23 @@ class Formulated:
         }  # fmt: skip
 
 
+@pytest.mark.parametrize("steep, by_slopes", [(0.05, True), (50.0, False)])
+def test_slopes_tell_an_interval_where_simulations_agree(steep, by_slopes):
+    """The interval of a is that of its own output: b follows it along a parabola."""
+
+    def formula(p, u):
+        return columns(p["a"] * u[:, 0], steep * (p["b"] - p["a"] ** 2) * u[:, 1])
+
+    problem = Problem(formula, [unknown("a", 2.0, "linear"), unknown("b", 4.0, "linear")], 0.5)
+    a = estimates(problem.tell())["a"]
+    assert (a.std is not None) is by_slopes
+    (record,) = problem.records
+    u, y = record.inputs[:, 0], record.outputs[:, 0]
+    value = float(u @ y / (u @ u))
+    half = Z95 * float(np.std(y - value * u)) / math.sqrt(float(u @ u))
+    assert (a.low, a.high) == pytest.approx((value - half, value + half), abs=0.1 * half)
+
+
 def same_interval(one, other):
     assert one.value == pytest.approx(other.value, rel=1e-4)
     assert (one.low, one.high) == pytest.approx((other.low, other.high), rel=1e-4)
