@@ -267,7 +267,7 @@ class GASSI(RecordEstimator):
         self.stopped_ = self._search(run, checkpoints, notify)
         self._set_run(run)
         try:
-            if self.stopped_ != "interrupted" and run.local is not None and self._cut is None:
+            if self.stopped_ != "interrupted" and not (earlier and earlier.is_settled):
                 self._search_held(run, searched, preset, notify)
             self._conclude(run, objective, notify, earlier)
         except KeyboardInterrupt:
@@ -308,7 +308,8 @@ class GASSI(RecordEstimator):
         objective: that of the search, over the parameters alone.
         """
         free, best = run.objective, run.best
-        assert run.local is not None and best is not None
+        if run.local is None or best is None or self._cut is not None:  # that had such runs
+            return
         if free.unexplained(free.rms(best.chromosome[None])[0]) < _FAR_OFF:
             return
         held = nudged(objective.simulator, objective.records)

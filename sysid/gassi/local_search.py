@@ -29,6 +29,7 @@ _BEFORE_GIVING_UP = 2  # iterations
 _MOST_POINTS, _FEWEST_POINTS = 16, 4  # along each parameter's range
 _FAR = (0.15, 0.45)  # parts of a range by which parameters move along their valleys
 _SLACK = 1e-8  # keeps parameters on which nothing depends from following
+_LAGS, _WHITE = 25, 0.3  # of residuals' correlations, and up to which these are noise's
 _ITERATIONS_EACH = 12  # what a descent from a first start may be expected to take
 
 _PLAIN_STATE = ("reserve", "polishing", "polished", "best", "error", "feasible")
@@ -152,16 +153,28 @@ class LocalSearch:
         return self.left < self.reserve + (self.iteration_cost if going_on else variation_cost)
 
     def _all_are_met(self) -> bool:
-        """Whether no more minima are expected than descents have ended in.
+        """Whether no more minima are expected than descents have ended in, and the best is right.
 
         Of n descents that ended in w minima, w (n - 1) / (n - w - 2) are expected in all (Boender
         and Rinnooy Kan, "Bayesian stopping rules for multistart global optimization methods",
-        Mathematical Programming 37, 1987). That is of starts at random; these lie around minima,
-        so that each of them has to have been varied in both ways.
+        Mathematical Programming 37, 1987). That is of starts at random, and of descents that all
+        end; these lie around minima, and some are given up. So each minimum has to have been varied
+        in both ways, and the best to leave nothing but noise.
         """
         w, n = len(self.minima), sum(minimum.met for minimum in self.minima)
         varied = all(minimum.varied >= 2 for minimum in self.minima)
-        return varied and n > w + 2 and w * (n - 1) < (w + 0.5) * (n - w - 2)
+        few = n > w + 2 and w * (n - 1) < (w + 0.5) * (n - w - 2)
+        return varied and few and self._leaves_noise()
+
+    def _leaves_noise(self) -> bool:
+        """Whether residuals of the best do not go on from sample to sample in any output."""
+        chromosome = self.objective.space.decode(self.best[None])
+        steps = self.objective.steps_needed(chromosome)
+        residual = self.objective.residuals(chromosome, steps).values[..., 0]
+        power = np.sum(residual**2, axis=0)
+        lags = range(1, min(_LAGS, len(residual)))
+        follow = [np.sum(residual[k:] * residual[:-k], axis=0) for k in lags]
+        return bool(np.all(np.abs(follow) <= _WHITE * power))
 
     def _polish(self) -> None:
         (descent,) = self.descents = refinement.advance(self.objective, self.descents)

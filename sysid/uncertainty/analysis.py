@@ -685,9 +685,10 @@ class _Analysis:
         rows = self.space.decode(np.stack([self.coded, *points]))
         values = self.objective.residuals(rows, local.steps).values
         weight = self.objective.least_squares_weights(local.residual)[:, None]
-        changes = np.sum(weight * (values[..., 1:] - values[..., :1]) ** 2, axis=(0, 1))
         steps = np.stack(points, axis=1) - self.coded[:, None]
-        shares: FloatArray = changes / np.sum(weight * (local.slopes @ steps) ** 2, axis=(0, 1))
+        with np.errstate(all="ignore"):  # where a simulation failed
+            changes = np.sum(weight * (values[..., 1:] - values[..., :1]) ** 2, axis=(0, 1))
+            shares: FloatArray = changes / np.sum(weight * (local.slopes @ steps) ** 2, axis=(0, 1))
         return shares
 
     def _ends_by_slopes(self, draft: _Draft) -> list[FloatArray]:

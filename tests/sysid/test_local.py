@@ -124,8 +124,8 @@ def test_a_search_ends_when_no_more_minima_are_expected():
 
 def met(*times, varied=2):
     """A search that is between descents, some of which have ended in minima so many times."""
-    target = objective(lag(), Dataset(np.ones(30), np.linspace(0.0, 1.0, 30), DT))
     rng = np.random.default_rng(0)
+    target = objective(lag(), Dataset(np.zeros(400), rng.normal(size=400), DT))
     local = LocalSearch(target, np.array([[1.0, 0.1]]), 10**6, 300, rng)
     local.descents, local.error = [], 1.0
     local.minima = [
@@ -143,6 +143,13 @@ def test_descents_tell_how_many_minima_there_are(times, most):
     local = met(*times)
     local.step()
     assert local.polishing == most
+
+
+def test_nothing_is_over_where_the_best_leaves_more_than_noise():
+    local = met(40)
+    local.objective = objective(lag(), Dataset(np.zeros(400), np.linspace(-1.0, 1.0, 400), DT))
+    local.step()
+    assert not local.polishing
 
 
 def test_nothing_is_over_before_each_minimum_has_been_varied_both_ways():
