@@ -24,7 +24,7 @@ from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.first_samples import noticed_starts, with_starts
 from sysid.gassi.genetic_search import PRESETS, GeneticSearch, Preset, PresetName
 from sysid.gassi.likelihood import Begun, NoisyInputs, fit_likelihood, promising
-from sysid.gassi.nudged import let_go, nudged
+from sysid.gassi.nudged import held, let_go
 from sysid.gassi.search_run import Best, SearchRun
 from sysid.problem.data import Dataset, require_information
 from sysid.problem.earlier_minima import EarlierMinima
@@ -312,11 +312,10 @@ class GASSI(RecordEstimator):
             return
         if free.unexplained(free.rms(best.chromosome[None])[0]) < _FAR_OFF:
             return
-        held = nudged(objective.simulator, objective.records)
-        if held is None:
+        by_held = held(objective)
+        if by_held is None:
             return
-        simulator, records = held
-        search = self._search_run(objective.simulated_by(simulator).on(records), preset, None)
+        search = self._search_run(by_held, preset, None)
         while not search.done:
             search.step()
             notify(Progress("refine", len(search.history), self.generations, self.error_))
@@ -608,11 +607,10 @@ class GASSI(RecordEstimator):
     def _searched(self, objective: Objective) -> Objective:
         """An objective of the records as that of what the search goes by."""
         excerpt = self.excerpt_
-        held = None if self._cut is None else nudged(objective.simulator, self._cut.records)
-        if held is not None and excerpt is not None:
-            simulator, records = held
-            excerpt = replace(excerpt, records=tuple(records), cut=False)
-            objective = objective.simulated_by(simulator)
+        by_held = None if self._cut is None else held(objective)
+        if by_held is not None and excerpt is not None:
+            objective = by_held
+            excerpt = replace(excerpt, records=objective.records, cut=False)
         return objective if excerpt is None else excerpt.among(objective)
 
     def _on_fitted(

@@ -60,13 +60,20 @@ def nudged(
     return simulator.of(_nudged(model, places)), driven
 
 
+def held(objective: Objective, forgetting: float = _FORGETTING) -> Objective | None:
+    """An objective by runs that measurements hold, None where no state is measured so."""
+    driven = nudged(objective.simulator, objective.records, forgetting)
+    if driven is None:
+        return None
+    simulator, records = driven
+    return objective.simulated_by(simulator).on(records)
+
+
 def let_go(free: Objective, chromosomes: Sequence[FloatArray]) -> list[Refinement]:
     """Minima of free runs beside those of runs that are held, (n_free,), as these are let go."""
     for forgetting in _LET_GO:
-        held = nudged(free.simulator, free.records, forgetting)
-        assert held is not None
-        simulator, records = held
-        objective = free.simulated_by(simulator).on(records)
+        objective = held(free, forgetting)
+        assert objective is not None
         ends = refine_each(objective, [begin(objective, each) for each in chromosomes])
         chromosomes = [end.chromosome for end in ends if np.isfinite(end.error)]
     return refine_each(free, [begin(free, each) for each in chromosomes])

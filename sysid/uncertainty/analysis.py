@@ -177,6 +177,18 @@ def uncertainty(
     """
     local = sensitivity(objective, chromosome)
     analysis = _Analysis(local, structure or ties(local), ridge)
+    drafts = [analysis.parameter(j) for j in range(len(chromosome))]
+    if profiled is not None:
+        drafts = [d if j in profiled else replace(d, tracer=None) for j, d in enumerate(drafts)]
+    tied = list(analysis.ambiguities())
+    combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
+    drafted = [*drafts, *combined]
+    confirmed = analysis.confirmed(drafted)
+    if confirmed != drafted and objective.free_run is objective and not objective.exact_slopes:
+        # Differences may have been too far for a valley so narrow.
+        exact = objective.with_exact_slopes()
+        if exact.exact_slopes:
+            return uncertainty(exact, chromosome, rivals, ridge, structure, profiled)
     bottoms = [_Analysis(sensitivity(objective, point), analysis.ties) for point in ridge]
     others = list(analysis.unlike(rivals))
     # A descent to a rival may have stopped short, by less than what is left open there.
@@ -190,17 +202,6 @@ def uncertainty(
             return _with_bottoms(estimate, apart)
         return replace(estimate, why="rival")
 
-    drafts = [analysis.parameter(j) for j in range(len(chromosome))]
-    if profiled is not None:
-        drafts = [d if j in profiled else replace(d, tracer=None) for j, d in enumerate(drafts)]
-    tied = list(analysis.ambiguities())
-    combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
-    confirmed = analysis.confirmed([*drafts, *combined])
-    if objective.free_run is objective and any(draft.is_refused for draft in confirmed):
-        # Differences may have been too far for a valley so narrow.
-        exact = objective.with_exact_slopes()
-        if exact.exact_slopes and not objective.exact_slopes:
-            return uncertainty(exact, chromosome, rivals, ridge, structure, profiled)
     settled = analysis.opened(analysis.settled(confirmed))
     harmless = analysis.harmless_ends(settled, profiled)
     whole = (_with_bottoms(estimate, bottoms) for estimate in settled)
@@ -292,14 +293,13 @@ class _Draft:
     """An estimate; without a deviation, unless it is tied, one whose ends its profile tells.
 
     traced: whether they are that profile's. place: of a parameter, a part of whose range may be
-    one where simulations fail. is_refused: whether simulations have refused its ends by slopes.
+    one where simulations fail.
     """
 
     estimate: Estimate
     tracer: Tracer | None = None
     place: int | None = None
     traced: bool = False
-    is_refused: bool = False
 
     def searches(self, fits: Sequence[Fit]) -> dict[float, Fit | None]:
         """Sides on which the profile is to be searched, and the fits to go on from."""
@@ -675,7 +675,7 @@ class _Analysis:
             if all(1.0 / _UNLIKE < share < _UNLIKE for share in at_ends):
                 return draft
             estimate = replace(draft.estimate, std=None, low=None, high=None)
-            return replace(draft, estimate=estimate, is_refused=True)
+            return replace(draft, estimate=estimate)
 
         return [judged(draft, len(each)) for draft, each in zip(drafts, ends, strict=True)]
 

@@ -121,6 +121,27 @@ def blank(model, inputs, dt, **first):
     return Dataset(inputs, outputs, dt)
 
 
+def pendulum_derivative(x, u, p):
+    theta, omega = x
+    inertia, viscous, weight = p
+    return omega, (u[0] - viscous * omega - weight * math.sin(theta)) / inertia
+
+
+def pendulum(theta=None, omega=None):
+    """A driven pendulum; theta, omega: ranges of its start where that is estimated."""
+    return ProcessModel(
+        "pendulum",
+        (State("theta", "rad", initial_range=theta), State("omega", "rad/s", initial_range=omega)),
+        (Input("torque", "N*m", "zoh"),), (Output("theta", "rad"),),
+        (
+            Parameter("inertia", "kg*m^2", 0.01, 0.001, 0.1, "log"),
+            Parameter("viscous", "N*m*s/rad", 0.01, 0.001, 0.1, "log"),
+            Parameter("weight", "N*m", 0.5, 0.05, 5.0, "log"),
+        ),
+        pendulum_derivative,
+    )  # fmt: skip
+
+
 def draw(model, rng, n):
     """Parameter vectors drawn from the model's ranges, on each parameter's scale."""
     vectors = np.tile(model.nominal, (n, 1))

@@ -18,29 +18,11 @@ from sysid import (
     State,
 )
 from sysid.fitting.objective import Objective
+from tests.sysid.support import pendulum
 
 # Which the package has a function of the same name for.
 profile = importlib.import_module("sysid.uncertainty.profile")
 DT, SAMPLES = 0.02, 400
-
-
-def pendulum_derivative(x, u, p):
-    theta, omega = x
-    inertia, viscous, weight = p
-    return omega, (u[0] - viscous * omega - weight * math.sin(theta)) / inertia
-
-
-def pendulum():
-    return ProcessModel(
-        "pendulum", (State("theta", "rad"), State("omega", "rad/s")),
-        (Input("torque", "N*m", "zoh"),), (Output("theta", "rad"),),
-        (
-            Parameter("inertia", "kg*m^2", 0.01, 0.001, 0.1, "log"),
-            Parameter("viscous", "N*m*s/rad", 0.01, 0.001, 0.1, "log"),
-            Parameter("weight", "N*m", 0.5, 0.05, 5.0, "log"),
-        ),
-        pendulum_derivative,
-    )  # fmt: skip
 
 
 def record_of(angle):

@@ -6,47 +6,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sysid import (
-    GASSI,
-    BatchSimulator,
-    Dataset,
-    Input,
-    Output,
-    Parameter,
-    ProcessModel,
-    SearchSpace,
-    State,
-)
+from sysid import GASSI, BatchSimulator, Dataset, SearchSpace
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
-from sysid.gassi.nudged import let_go, nudged
+from sysid.gassi.nudged import held, let_go
+from tests.sysid.support import pendulum, pendulum_derivative
 
 DT, SAMPLES, NOISE = 0.01, 1500, 9e-4
 TRUTH = {"inertia": 0.0143, "viscous": 0.0145, "weight": 0.668}
-
-
-def derivative(x, u, p):
-    theta, omega = x
-    inertia, viscous, weight = p
-    return omega, (u[0] - viscous * omega - weight * math.sin(theta)) / inertia
-
-
-def pendulum():
-    return ProcessModel(
-        "pendulum",
-        (
-            State("theta", "rad", initial_range=(-0.2, 0.2)),
-            State("omega", "rad/s", initial_range=(-2.0, 2.0)),
-        ),
-        (Input("torque", "N*m", "zoh"),),
-        (Output("theta", "rad"),),
-        (
-            Parameter("inertia", "kg*m^2", 0.01, 0.001, 0.1, "log"),
-            Parameter("viscous", "N*m*s/rad", 0.01, 0.001, 0.1, "log"),
-            Parameter("weight", "N*m", 0.5, 0.05, 5.0, "log"),
-        ),
-        derivative,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +25,7 @@ def record():
     for level in torque:
         angles.append(state[0])
         state = solve_ivp(
-            lambda t, x, level=level: derivative(x, (level,), TRUTH.values()),
+            lambda t, x, level=level: pendulum_derivative(x, (level,), TRUTH.values()),
             (0.0, DT), state, rtol=1e-11, atol=1e-12,
         ).y[:, -1]  # fmt: skip
     assert np.ptp(angles) > 4.0 * math.pi, "it turns over"
@@ -66,7 +33,7 @@ def record():
 
 
 def objective(record):
-    model = pendulum()
+    model = pendulum(theta=(-0.2, 0.2), omega=(-2.0, 2.0))
     space = SearchSpace.of(model).with_starts([record])
     return Objective(BatchSimulator(model), space, [record])
 
@@ -76,16 +43,14 @@ def test_what_measurements_hold_leads_the_free_run_where_it_would_not_go_alone(r
     start = np.array([*(1.3 * value for value in TRUTH.values()), 0.0, 0.0])
     alone = refine(free, start)
     assert free.unexplained(alone.rms) > 0.1
-    simulator, records = nudged(free.simulator, [record])
-    held = refine(free.simulated_by(simulator).on(records), start)
-    (end,) = let_go(free, [held.chromosome])
+    (end,) = let_go(free, [refine(held(free), start).chromosome])
     np.testing.assert_allclose(end.chromosome[:3], list(TRUTH.values()), rtol=2e-3)
     assert free.unexplained(end.rms) < 1e-2
 
 
 @pytest.mark.soak
 def test_it_is_found_and_its_intervals_hold_the_truth(record):
-    fitted = GASSI(pendulum(), random_state=0).fit(record)
+    fitted = GASSI(pendulum(theta=(-0.2, 0.2), omega=(-2.0, 2.0)), random_state=0).fit(record)
     assert fitted.error_ * np.abs(record.outputs).max() == pytest.approx(NOISE, rel=0.05)
     for estimate in fitted.uncertainty(record).parameters:
         if estimate.name in TRUTH:
