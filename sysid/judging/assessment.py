@@ -42,6 +42,8 @@ _MOSTLY = 0.3  # above which it is no noise at all
 # Of an output's variance, beyond which what a model leaves may have moved its parameters, and share
 # of the autocorrelations inside their band, below which it is no noise of that output's sensor.
 _MUCH, _WANDERS = 0.025, 0.25
+# Share of them inside it, and fit [%], from where on a poor fit may be for a sensor's noise alone.
+_WHITE, _SOMETHING = 0.9, 10.0
 # Residuals in parts of what is to be expected of a right model, above which there is more in them
 # than noise, and the probability below which it is not by chance.
 _ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
@@ -229,10 +231,11 @@ def _prediction(
 ) -> Statement:
     """How well outputs are predicted."""
     grave, light = list(broken), list[str]()
-    for name, ratio, fit, beyond, at_floor in _validation_errors(model, training, validation):
-        if fit < FITTED and not at_floor:
-            grave.append(f"{name} is explained poorly on the validation data (fit {fit:.0f} %).")
-        elif ratio > _HARDLY_WORSE and beyond > _SMALL and not at_floor:
+    poor, noisy = _poor_fits(model, validation, "on the validation data")
+    grave += poor.values()
+    light += noisy.values()
+    for name, ratio, beyond, at_floor in _validation_errors(model, training, validation):
+        if ratio > _HARDLY_WORSE and beyond > _SMALL and not at_floor and name not in poor:
             reasons = grave if ratio > _FAR_WORSE and beyond > _HARDLY_WORSE * _SMALL else light
             reasons.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
     voided = [f.sentence for f in faults if f.severity == "doubt" and f.voids_validation]
@@ -241,19 +244,36 @@ def _prediction(
     elif not validation:
         light.append("No data were held back for validation: the errors are those of the fit.")
     if not grave:
-        grave += _poor_fits(model, training)
+        poor, noisy_there = _poor_fits(model, training, "even on the training data")
+        grave += poor.values()
+        light += (reason for name, reason in noisy_there.items() if name not in noisy)
     light += _input_traces(model, validation or training)
     light += _failing_starts((*training, *validation))
     return Statement.of(grave, light, _praise(model, validation))
 
 
-def _poor_fits(model: ProcessModel, training: Sequence[RecordResult]) -> Iterator[str]:
-    """Reasons: outputs that are not explained even where the model was fitted to them."""
-    fits = mean_known([result.metrics.fit for result in training], 0)
-    floor = ~_above_noise(training) & _known(training)
-    for name, fit, at_floor in zip(model.output_names, fits, floor, strict=True):
-        if fit < FITTED and not at_floor:
-            yield f"{name} is explained poorly even on the training data (fit {fit:.0f} %)."
+def _poor_fits(
+    model: ProcessModel, results: Sequence[RecordResult], where: str
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Reasons by output: what is explained poorly, and that of which only noise is left.
+
+    What comes anew with each sample, and goes with no input, no model explains.
+    """
+    poor, noisy = dict[str, str](), dict[str, str]()
+    if not results:
+        return poor, noisy
+    fits = mean_known([result.metrics.fit for result in results], 0)
+    floor = ~_above_noise(results) & _known(results)
+    white = np.mean([result.residuals.white for result in results], axis=0) > _WHITE
+    noise = white & ~_follows(results).any(axis=1) & (fits > _SOMETHING)
+    for j in np.flatnonzero((fits < FITTED) & ~floor).tolist():
+        name = model.output_names[j]
+        reason = f"{name} is explained poorly {where} (fit {fits[j]:.0f} %)"
+        if noise[j]:
+            noisy[name] = f"{reason}, but what is left is white, as a sensor's noise is."
+        else:
+            poor[name] = f"{reason}."
+    return poor, noisy
 
 
 def _of_intervals(
@@ -289,11 +309,10 @@ def _failed_runs(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
 
 def _validation_errors(
     model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
-) -> list[tuple[str, float, float, float, bool]]:
-    """Of each output: error in validation in parts of that in training, fit [%], and by how much
+) -> list[tuple[str, float, float, bool]]:
+    """Of each output: error in validation in parts of that in training, and by how much it is
 
-    the error in validation is beyond that in training, in parts of the output's deviation; whether
-    it is that of the noise alone.
+    beyond that, in parts of the output's deviation; whether it is that of the noise alone.
     """
     if not validation:
         return []
@@ -308,7 +327,7 @@ def _validation_errors(
         # A fit of 90 % is an error of a tenth of the deviation.
         beyond = (1.0 - fits / 100.0) * np.sqrt(np.maximum(1.0 - 1.0 / ratios**2, 0.0))
     floor = ~_above_noise(validation) & _known(validation)
-    columns = (ratios, fits, beyond)
+    columns = (ratios, beyond)
     values = zip(*(column.tolist() for column in columns), floor.tolist(), strict=True)
     return [(name, *row) for name, row in zip(model.output_names, values, strict=True)]
 
