@@ -26,18 +26,18 @@ from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.profile import Fit, Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
 from sysid.uncertainty.sensitivity import Sensitivity, bend_errors, sensitivity
+from sysid.uncertainty.simulated_ends import SimulatedEnds
 from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
 
-# Standard deviation of a logarithm above which the slopes at the estimate are no guide.
-_WEAK = 0.1
+# Standard deviation of a logarithm above which the slopes at the estimate are a guide only if
+# simulations agree, and above which they are none.
+_WIDE, _WEAK = 0.1, 0.3
 _AWAY = 0.5  # deviations between an estimate and the minimum that slopes foretell
 _SAMPLED = 40  # points of a range at which it is tried whether simulations fail
 _DRAWS = 20_000  # of all quantities together
 _ALIKE = 0.05  # rivals closer than this are one
 _NOT_BY_CHANCE = 3.3  # deviations: one in a thousand
 _SIDES = (-1.0, 1.0)
-_AT_ONCE = 15  # ends of intervals that are simulated side by side
-_UNLIKE = 5.0  # times what slopes foretell at an interval's end, from where they are no guide
 _ROUNDS = 3  # of searches that go on from what others came to
 _FAR = 0.1  # of the way to an end, by which such a place is beyond it
 _LEAST = 1e-12  # variance, and share of others', of what a covariance holds for known exactly
@@ -172,19 +172,22 @@ def uncertainty(
     The estimate is taken as the minimum of the objective; the colour of its residuals and the
     records' zero errors enter the covariance. rivals: other minima that explain the data as well.
     ridge: further points of the valley that the chromosome lies in. structure: what the equations
-    leave undetermined, by default what the model's do. profiled: coordinates whose profiles are
-    traced where slopes are no guide, default all.
+    leave undetermined, by default what the model's do. profiled: coordinates whose intervals are
+    asked for: of the others no profiles are traced, nor of what they are in; default all.
     """
     local = sensitivity(objective, chromosome)
     analysis = _Analysis(local, structure or ties(local), ridge)
+    names = objective.space.names
+    hidden = {n for j, n in enumerate(names) if profiled is not None and j not in profiled}
     drafts = [analysis.parameter(j) for j in range(len(chromosome))]
-    if profiled is not None:
-        drafts = [d if j in profiled else replace(d, tracer=None) for j, d in enumerate(drafts)]
     tied = list(analysis.ambiguities())
     combined = [analysis.combination(c) for _, combinations in tied for c in combinations]
-    drafted = [*drafts, *combined]
-    confirmed = analysis.confirmed(drafted)
-    if confirmed != drafted and objective.free_run is objective and not objective.exact_slopes:
+    drafted = [
+        replace(draft, tracer=None) if draft.estimate.is_of(hidden) else draft
+        for draft in (*drafts, *combined)
+    ]
+    doubted = analysis.doubted(drafted)
+    if doubted.any() and objective.free_run is objective and not objective.exact_slopes:
         # Differences may have been too far for a valley so narrow.
         exact = objective.with_exact_slopes()
         if exact.exact_slopes:
@@ -202,6 +205,7 @@ def uncertainty(
             return _with_bottoms(estimate, apart)
         return replace(estimate, why="rival")
 
+    confirmed = analysis.confirmed(drafted, doubted)
     settled = analysis.opened(analysis.settled(confirmed))
     harmless = analysis.harmless_ends(settled, profiled)
     whole = (_with_bottoms(estimate, bottoms) for estimate in settled)
@@ -237,7 +241,7 @@ def uncertainty(
         bent=_bent(local),
         by_slopes=analysis.covariance.matrix,
     )
-    intervals = [e.name for e in result.determined()]
+    intervals = [e.name for e in result.determined() if not e.is_of(hidden)]
     joint, simultaneous = analysis.together(intervals)
     moved = analysis.moved_by_bends(intervals) if np.any(result.bent > MISJUDGED) else 0.0
     return replace(result, joint=joint, simultaneous=simultaneous, moved_by_bends=moved)
@@ -292,14 +296,19 @@ def _bent(local: Sensitivity) -> FloatArray:
 class _Draft:
     """An estimate; without a deviation, unless it is tied, one whose ends its profile tells.
 
-    traced: whether they are that profile's. place: of a parameter, a part of whose range may be
-    one where simulations fail.
+    traced: whether they are that profile's. wide: whether slopes are a guide only if simulations
+    agree. place: of a parameter, a part of whose range may be one where simulations fail.
     """
 
     estimate: Estimate
     tracer: Tracer | None = None
     place: int | None = None
     traced: bool = False
+    wide: bool = False
+
+    def without_interval(self) -> Self:
+        """The same, of which slopes tell nothing."""
+        return replace(self, estimate=replace(self.estimate, std=None, low=None, high=None))
 
     def searches(self, fits: Sequence[Fit]) -> dict[float, Fit | None]:
         """Sides on which the profile is to be searched, and the fits to go on from."""
@@ -464,13 +473,16 @@ class _Analysis:
             return _Draft(estimate, tracer, j)
         low, high = (self._decoded(j, self.coded[j] + sign * Z95 * deviation) for sign in _SIDES)
         std = deviation * abs(float(self.local.increments[j]))
-        return _Draft(replace(estimate, std=std, low=low, high=high), tracer, j)
+        wide = bool(self.space.log[j] and deviation >= _WIDE)
+        return _Draft(replace(estimate, std=std, low=low, high=high), tracer, j, wide=wide)
 
     def by_slopes(self, estimate: Estimate) -> Estimate:
-        """A quantity's estimate here; without a deviation where slopes are no guide."""
+        """A quantity's estimate here; without a deviation where slopes alone are no guide."""
         if estimate.combination is not None:
-            return self.combination(estimate.combination).estimate
-        return self.parameter(self.space.names.index(estimate.name)).estimate
+            draft = self.combination(estimate.combination)
+        else:
+            draft = self.parameter(self.space.names.index(estimate.name))
+        return draft.without_interval().estimate if draft.wide else draft.estimate
 
     def ambiguities(self) -> Iterator[tuple[Ambiguity, list[Invariant]]]:
         """Parameters that hang together by the equations, and the combinations that do not."""
@@ -642,7 +654,8 @@ class _Analysis:
             low, high = sorted(value * np.exp(sign * Z95 * deviation / value) for sign in _SIDES)
         else:
             low, high = (value + sign * Z95 * deviation for sign in _SIDES)
-        return _Draft(replace(estimate, std=deviation, low=float(low), high=float(high)), tracer)
+        estimate = replace(estimate, std=deviation, low=float(low), high=float(high))
+        return _Draft(estimate, tracer, wide=positive and deviation >= _WIDE * value)
 
     def _wanted_beyond(self, combination: Invariant, gradient: FloatArray) -> bool:
         """Whether the data push what changes so (n_free,) beyond what ranges of its members allow.
@@ -655,57 +668,28 @@ class _Analysis:
         step, deviation = gradient @ self.free.newton_step, self.free.deviation(gradient)
         return bool(abs(step) > Z95 * deviation)
 
-    def confirmed(self, drafts: Sequence[_Draft]) -> list[_Draft]:
-        """Drafts, without deviations that simulations refuse.
+    def doubted(self, drafts: Sequence[_Draft]) -> BoolArray:
+        """Which drafts' intervals, (n,), simulations refuse at the ends that slopes tell."""
+        by_slopes = ((i, d) for i, d in enumerate(drafts) if d.estimate.std is not None)
+        tracers = {i: draft.tracer for i, draft in by_slopes if draft.tracer}
+        doubted = np.zeros(len(drafts), dtype=bool)
+        doubted[[*tracers]] = ~np.array(self._ends.as_foretold([*tracers.values()]), dtype=bool)
+        return doubted
 
-        At the ends of an interval by slopes, all else following as slopes say, residuals are to
-        have changed about as these foretell, if they are a guide that far.
+    def confirmed(self, drafts: Sequence[_Draft], doubted: BoolArray) -> list[_Draft]:
+        """Drafts without intervals that slopes tell and profiles would not.
+
+        Of what is doubted, and of what is so wide that slopes alone are no guide.
         """
-        if self.local.criterion is not self.objective:  # of which the slopes are not
-            return [*drafts]
-        ends = [self._ends_by_slopes(draft) for draft in drafts]
-        points = [end for each in ends for end in each]
-        parts = [
-            self._as_foretold(points[k : k + _AT_ONCE]) for k in range(0, len(points), _AT_ONCE)
-        ]
-        shares = iter(np.concatenate([np.zeros(0), *parts]))
+        wanted = ((i, d) for i, d in enumerate(drafts) if doubted[i] or d.wide)
+        tracers = {i: draft.tracer for i, draft in wanted if draft.tracer}
+        kept = self._ends.at_the_level([*tracers.values()])
+        refused = {i for i, is_kept in zip(tracers, kept, strict=True) if not is_kept}
+        return [d.without_interval() if i in refused else d for i, d in enumerate(drafts)]
 
-        def judged(draft: _Draft, n_ends: int) -> _Draft:
-            at_ends = [next(shares) for _ in range(n_ends)]
-            if all(1.0 / _UNLIKE < share < _UNLIKE for share in at_ends):
-                return draft
-            estimate = replace(draft.estimate, std=None, low=None, high=None)
-            return replace(draft, estimate=estimate)
-
-        return [judged(draft, len(each)) for draft, each in zip(drafts, ends, strict=True)]
-
-    def _as_foretold(self, points: Sequence[FloatArray]) -> FloatArray:
-        """Sums of squares by which residuals change, in parts of what slopes foretell, (n,)."""
-        local = self.local
-        rows = self.space.decode(np.stack([self.coded, *points]))
-        values = self.objective.residuals(rows, local.steps).values
-        weight = self.objective.least_squares_weights(local.residual)[:, None]
-        steps = np.stack(points, axis=1) - self.coded[:, None]
-        with np.errstate(all="ignore"):  # where a simulation failed
-            changes = np.sum(weight * (values[..., 1:] - values[..., :1]) ** 2, axis=(0, 1))
-            shares: FloatArray = changes / np.sum(weight * (local.slopes @ steps) ** 2, axis=(0, 1))
-        return shares
-
-    def _ends_by_slopes(self, draft: _Draft) -> list[FloatArray]:
-        """Search coordinates (n_free,) of an interval's ends in the ranges, if slopes have any.
-
-        What stands on an end of its range is no part of the way there.
-        """
-        if draft.tracer is None or draft.estimate.std is None:
-            return []
-        gradient = draft.tracer.gradient
-        along = self.covariance.curvature @ gradient
-        far = Z95 * self.covariance.deviation(gradient) / float(gradient @ along)
-        lower, upper = self.space.coded_bounds
-        if np.any(along[self.on_bound]):
-            return []
-        ends = [self.coded + sign * far * along for sign in _SIDES]
-        return [end for end in ends if np.all((end >= lower) & (end <= upper))]
+    @cached_property
+    def _ends(self) -> SimulatedEnds:
+        return SimulatedEnds(self.local, self.covariance, self.on_bound)
 
     def settled(self, drafts: Sequence[_Draft]) -> list[Estimate]:
         """Estimates with the ends that profiles tell.

@@ -1,6 +1,7 @@
 """An identified quantity: a parameter, or a combination of several, with its unit."""
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -70,6 +71,11 @@ class Estimate:
         if self.std is not None or self.low is None or self.high is None:
             return self.std
         return (self.high - self.low) / (2.0 * Z95)
+
+    def is_of(self, names: AbstractSet[str]) -> bool:
+        """Whether it is one of these parameters, or a combination that any of them is in."""
+        members = self.combination.names if self.combination else (self.name,)
+        return not names.isdisjoint(members)
 
     def at(self, parameters: Mapping[str, float]) -> float:
         """Value of the quantity for other values of the parameters."""

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 from scipy.linalg import block_diag, toeplitz
+from scipy.optimize import brentq
 from scipy.signal import lfilter
 
 from benchmarks._common import simulated_logs
@@ -497,12 +498,17 @@ class Formulated:
         }  # fmt: skip
 
 
-@pytest.mark.parametrize("steep, by_slopes", [(0.05, True), (50.0, False)])
-def test_slopes_tell_an_interval_where_simulations_agree(steep, by_slopes):
+@pytest.mark.parametrize(
+    ("steep", "bend", "by_slopes"),
+    [(0.05, 0.0, True), (50.0, 0.0, True), (0.05, 1.5e5, False), (50.0, 1.5e5, False)],
+    ids=["straight", "in a valley that bends", "bent itself", "bent itself, in such a valley"],
+)
+def test_slopes_tell_an_interval_where_simulations_agree(steep, bend, by_slopes):
     """The interval of a is that of its own output: b follows it along a parabola."""
 
     def formula(p, u):
-        return columns(p["a"] * u[:, 0], steep * (p["b"] - p["a"] ** 2) * u[:, 1])
+        own = p["a"] + bend * (p["a"] - 2.0) ** 5
+        return columns(own * u[:, 0], steep * (p["b"] - p["a"] ** 2) * u[:, 1])
 
     problem = Problem(formula, [unknown("a", 2.0, "linear"), unknown("b", 4.0, "linear")], 0.5)
     a = estimates(problem.tell())["a"]
@@ -511,7 +517,9 @@ def test_slopes_tell_an_interval_where_simulations_agree(steep, by_slopes):
     u, y = record.inputs[:, 0], record.outputs[:, 0]
     value = float(u @ y / (u @ u))
     half = Z95 * float(np.std(y - value * u)) / math.sqrt(float(u @ u))
-    assert (a.low, a.high) == pytest.approx((value - half, value + half), abs=0.1 * half)
+    ends = [brentq(lambda t, at=at: 2.0 + t + bend * t**5 - at, -1.0, 1.0)
+            for at in (value - half, value + half)]  # fmt: skip
+    assert (a.low - 2.0, a.high - 2.0) == pytest.approx(ends, abs=0.1 * half)
 
 
 def same_interval(one, other):

@@ -1,0 +1,181 @@
+"""Do simulations agree with slopes at the ends of an interval?
+
+Slopes at the estimate tell how far a quantity may be from it, and how all else follows on the way
+d to an end. Two things are asked of simulations there:
+
+1. Residuals are to have changed about as slopes foretell.
+2. In a narrow valley that bends, the straight way ends high up its wall, however right the interval
+   is. From the errors e there, a step b = -(H + mu I)^-1 sum_j w_j J_j' e_j that leaves the
+   quantity where it is leads back, by the slopes J at the estimate, and so the next. What is lost
+   at the bottom is no less than what the profile loses there, and is to be about its level. mu
+   keeps b from going along the valley, in which all else stays where d led.
+
+That takes one simulation of each end at a time, all side by side; a profile takes many fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sysid.arrays import BoolArray, FloatArray
+from sysid.uncertainty.covariance import Covariance
+from sysid.uncertainty.estimate import Z95
+from sysid.uncertainty.profile import Tracer
+from sysid.uncertainty.sensitivity import Sensitivity
+
+_SIDES = (-1.0, 1.0)
+_AT_ONCE = 15  # ends that are simulated side by side
+_UNLIKE = 5.0  # times what slopes foretell, in squares, from where they are no guide
+_RESTORING = 1e-7  # mu in parts of the largest curvature, both in parts of the ranges
+_STEPS = 8  # back into a valley
+_SETTLED = 0.01  # of the root of the statistic, below which a step back does not matter any more
+# The root of the statistic in parts of that of its level, where an interval ends as it should.
+_LEAST, _MOST = 0.93, 1.2
+
+
+@dataclass(frozen=True)
+class _End:
+    """Search coordinates (n_free,) of an end of an interval, of which of them, and what is there.
+
+    root: of the statistic, in parts of its level's.
+    """
+
+    place: int
+    point: FloatArray
+    root: float = np.inf
+    settled: bool = False
+
+
+@dataclass(frozen=True)
+class SimulatedEnds:
+    """Ends of intervals by slopes. on_bound: (n_free,), coordinates on an end of their range."""
+
+    local: Sensitivity
+    covariance: Covariance
+    on_bound: BoolArray
+
+    def as_foretold(self, tracers: Sequence[Tracer]) -> list[bool]:
+        """Whether residuals change about as slopes foretell, or that cannot be told.
+
+        It is not where slopes are not of the criterion, nor beyond the ranges, nor where something
+        on an end of its range would follow.
+        """
+        if self.local.criterion is not self.local.objective:
+            return [True] * len(tracers)
+        ends = [
+            _End(i, point)
+            for i, tracer in enumerate(tracers)
+            if not np.any(self._along(tracer)[self.on_bound])
+            for point in self._ends(tracer)
+            if self._is_inside(point)
+        ]
+        alike = [True] * len(tracers)
+        for k in range(0, len(ends), _AT_ONCE):
+            batch = ends[k : k + _AT_ONCE]
+            for end, share in zip(batch, self._shares([end.point for end in batch]), strict=True):
+                alike[end.place] &= 1.0 / _UNLIKE < share < _UNLIKE
+        return alike
+
+    def at_the_level(self, tracers: Sequence[Tracer]) -> list[bool]:
+        """Whether the profile, led to as by chords, is about at its level at both ends.
+
+        Coordinates on an end of their range stay there.
+        """
+        ends = [_End(i, point) for i, tracer in enumerate(tracers) for point in self._ends(tracer)]
+        alike = [True] * len(tracers)
+        for end in ends:
+            alike[end.place] &= self._is_inside(end.point)
+        for _ in range(1 + _STEPS):
+            live = [i for i, end in enumerate(ends) if alike[end.place] and not end.settled]
+            for k in range(0, len(live), _AT_ONCE):
+                batch = live[k : k + _AT_ONCE]
+                for i, end in zip(batch, self._led_back(tracers, batch, ends), strict=True):
+                    ends[i] = end
+                    alike[end.place] &= end.root >= _LEAST and np.isfinite(end.root)
+        for end in ends:
+            alike[end.place] &= end.root <= _MOST
+        return alike
+
+    def _led_back(
+        self, tracers: Sequence[Tracer], batch: Sequence[int], ends: Sequence[_End]
+    ) -> list[_End]:
+        """Some of the ends with what is there, and one step further where that has changed."""
+        points = np.stack([ends[i].point for i in batch])
+        criterion, space = self.local.criterion, self.local.objective.space
+        responses = criterion.residuals(space.decode(points), self.local.steps)
+        losses = criterion.error_of(responses.rms) - self._error
+        onward = []
+        for i, loss, values in zip(batch, losses, np.moveaxis(responses.values, 2, 0), strict=True):
+            end, tracer = ends[i], tracers[ends[i].place]
+            root = float(np.sqrt(tracer.statistic(float(loss)))) / Z95
+            settled = bool(abs(end.root - root) <= _SETTLED * root)
+            point = end.point
+            if np.isfinite(root) and not settled:
+                point = np.clip(point + self._step_back(tracer, values), *space.coded_bounds)
+            onward.append(replace(end, point=point, root=root, settled=settled))
+        return onward
+
+    def _step_back(self, tracer: Tracer, errors: FloatArray) -> FloatArray:
+        """b of a tracer's quantity, (n_free,), by errors (n_residuals, n_outputs)."""
+        width = self.local.objective.space.width
+        inverse, gradient = self._inverse, tracer.gradient * width * ~self.on_bound
+        push = np.einsum("tip,ti->p", self._weighted, errors) * width
+        step, across = -inverse @ push, inverse @ gradient
+        kept: FloatArray = step - across * (gradient @ step) / (gradient @ across)
+        return kept * width
+
+    @cached_property
+    def _weighted(self) -> FloatArray:
+        """Slopes by their outputs' weights; none of what stays on an end of its range."""
+        weight = self.local.objective.least_squares_weights(self.local.residual)
+        return self.local.slopes * weight[:, None] * ~self.on_bound
+
+    @cached_property
+    def _inverse(self) -> FloatArray:
+        """(H + mu I)^-1 in parts of the ranges, (n_free, n_free)."""
+        width = self.local.objective.space.width
+        hessian = np.einsum("tip,tiq->pq", self._weighted, self.local.slopes * ~self.on_bound)
+        hessian *= np.outer(width, width)
+        mu = _RESTORING * float(np.diag(hessian).max())
+        inverse: FloatArray = np.linalg.inv(hessian + mu * np.eye(len(width))).astype(np.float64)
+        return inverse
+
+    @cached_property
+    def _error(self) -> float:
+        """Of the estimate, by the same steps as of the ends."""
+        rms = self.local.criterion.residuals(
+            self.local.chromosome[None], self.local.steps, keep=False
+        ).rms
+        return float(self.local.criterion.error_of(rms)[0])
+
+    def _along(self, tracer: Tracer) -> FloatArray:
+        along: FloatArray = self.covariance.curvature @ tracer.gradient
+        return along
+
+    def _ends(self, tracer: Tracer) -> list[FloatArray]:
+        """Search coordinates (n_free,) of both ends, what is on an end of its range left there."""
+        along, gradient = self._along(tracer) * ~self.on_bound, tracer.gradient
+        far = Z95 * self.covariance.deviation(gradient) / float(gradient @ along)
+        at = self.local.objective.space.encode(self.local.chromosome)
+        return [at + sign * far * along for sign in _SIDES]
+
+    def _is_inside(self, point: FloatArray) -> bool:
+        lower, upper = self.local.objective.space.coded_bounds
+        return bool(np.all((point >= lower) & (point <= upper)))
+
+    def _shares(self, points: Sequence[FloatArray]) -> FloatArray:
+        """Sums of squares by which residuals change, in parts of what slopes foretell, (n,)."""
+        local, space = self.local, self.local.objective.space
+        at = space.encode(local.chromosome)
+        rows = space.decode(np.stack([at, *points]))
+        values = local.objective.residuals(rows, local.steps).values
+        weight = local.objective.least_squares_weights(local.residual)[:, None]
+        steps = np.stack(points, axis=1) - at[:, None]
+        with np.errstate(all="ignore"):  # where a simulation failed
+            changes = np.sum(weight * (values[..., 1:] - values[..., :1]) ** 2, axis=(0, 1))
+            shares: FloatArray = changes / np.sum(weight * (local.slopes @ steps) ** 2, axis=(0, 1))
+        return shares
