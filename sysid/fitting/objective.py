@@ -246,9 +246,7 @@ class Objective:
         """
         space, model = self.space, self.simulator.model
         n, shared = len(chromosomes), len(space.index)
-        starts: list[list[tuple[int, int]]] = [[] for _ in self.records]
-        for column, (place, state) in enumerate(space.estimated, shared):
-            starts[place].append((column, state))
+        starts = space.starts_by_record(len(self.records))
         most = max(map(len, starts), default=0)
         along = np.zeros((n, shared + most, len(model.parameters)))
         along[:, :shared] = space.directions(chromosomes)

@@ -29,8 +29,8 @@ part of the undamped step; and, where nothing gains what is promised, lengths of
 with the valley. With exact slopes all of these are led back into the valley instead: they tell a
 floor from walls that are a hundred million times as steep, which differences do not.
 
-H is never summed up, for then only a hundred million remain of what 53 bits can tell: with
-orthogonal factors of the J_j, weighed and one above the other, it is H = R'R.
+H = R'R. With exact slopes it is never summed up, for then only a hundred million remain of what 53
+bits can tell: R is of orthogonal factors of the J_j, weighed and one above the other.
 """
 
 from __future__ import annotations
@@ -85,10 +85,11 @@ class Quadratic:
         """At a point, by the residuals and slopes there; floor: of the outputs' errors."""
         rms, weights = around.rms, objective.weights
         c = weights / (np.maximum(rms, floor) * np.maximum(objective.counts, 1))
-        root, right = around.slopes.triangle(around.residual, c)
+        exact, slopes = objective.exact_slopes, around.slopes
+        root, right = (slopes.triangle if exact else slopes.root)(around.residual, c)
         error = float(smoothed(rms, floor) @ weights)
         least, lengths = _LEAST_DAMPING, np.array([_PART])
-        if objective.exact_slopes:
+        if exact:
             least, lengths = _LEAST_BY_TANGENTS, _LENGTHS
         return cls(root, right, error, c, least, lengths)
 

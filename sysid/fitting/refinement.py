@@ -40,6 +40,7 @@ from sysid.fitting.descent import (
     Shift,
     resumed,
 )
+from sysid.fitting.neighbours import Neighbours
 from sysid.fitting.objective import FLOORS, Linearisation, Objective, Responses
 from sysid.fitting.quadratic import (
     CANDIDATES,
@@ -188,7 +189,7 @@ def errors_of(objective: Objective, descents: Sequence[Descent]) -> FloatArray:
 
 def simulations_per_iteration(objective: Objective) -> int:
     """Most simulations that an iteration of one descent takes."""
-    return 3 + len(objective.space.parameters) + CANDIDATES
+    return 3 + Neighbours.of(objective).count + CANDIDATES
 
 
 def curvature(objective: Objective, at: FloatArray) -> FloatArray:
@@ -391,21 +392,20 @@ def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
     return distance
 
 
-def _neighbourhood(space: SearchSpace, descent: Descent) -> FloatArray:
-    """A descent's point and its neighbours, (1 + n_free, n_free)."""
-    at, distance = descent.point.at, _distance(space, descent)
-    return np.vstack([at, at + np.diag(distance * space.width)])
-
-
 def _linearised(objective: Objective, descents: list[Descent]) -> list[Linearisation]:
     """Residuals and slopes where descents stand, by their steps."""
     space = objective.space
     if not objective.exact_slopes:
-        rows = [_neighbourhood(space, descent) for descent in descents]
+        neighbours = Neighbours.of(objective)
+        distances = [_distance(space, descent) for descent in descents]
+        rows = [
+            neighbours.around(descent.point.at, distance * space.width)
+            for descent, distance in zip(descents, distances, strict=True)
+        ]
         around = _responses(objective, descents, rows)
         return [
-            _by_differences(objective, responses, _distance(space, descent))
-            for responses, descent in zip(around, descents, strict=True)
+            _by_differences(objective, neighbours, *each)
+            for each in zip(descents, around, distances, strict=True)
         ]
     rows = [descent.point.at[None] for descent in descents]
     steps = np.array([descent.steps for descent in descents])
@@ -414,31 +414,40 @@ def _linearised(objective: Objective, descents: list[Descent]) -> list[Linearisa
     return [_by_tangents(objective, *each) for each in zip(descents, here, tangents, strict=True)]
 
 
-def _by_differences(objective: Objective, around: Responses, distance: FloatArray) -> Linearisation:
-    with np.errstate(over="ignore", invalid="ignore"):  # slopes at the edge of stability
-        slopes = (around.values[..., 1:] - around.values[..., :1]) / distance
-    errors = objective.error_of(around.rms[1:])
+def _by_differences(
+    objective: Objective,
+    neighbours: Neighbours,
+    descent: Descent,
+    around: Responses,
+    distance: FloatArray,
+) -> Linearisation:
+    values = around.values if descent.restriction.tether is None else around.values[:-1]
+    slopes = _tethered(objective, descent, neighbours.slopes(values, distance))
+    errors = objective.error_of(around.rms[1:])[neighbours.places]
     excess = float(around.excess[0])
-    return Linearisation(around.values[..., 0], Slopes.of(slopes), around.rms[0], excess, errors)
+    return Linearisation(around.values[..., 0], slopes, around.rms[0], excess, errors)
 
 
 def _by_tangents(
     objective: Objective, descent: Descent, here: Responses, tangents: tuple[SlopeBlock, ...]
 ) -> Linearisation:
     """tangents: by the search coordinates."""
-    space, tether = objective.space, descent.restriction.tether
-    slopes = scaled(tangents, space.width)
-    if tether is not None:
-        shift = _OF_TETHER * np.diag(space.width)
-        ahead, behind = (
-            tether(space.decode(descent.point.at + way * shift)) for way in (1.0, -1.0)
-        )
-        row = np.zeros((len(objective.weights), len(space.width)))
-        row[int(np.argmax(objective.weights))] = (ahead - behind) / (2.0 * _OF_TETHER)
-        slopes = joined(slopes, row)
+    slopes = _tethered(objective, descent, scaled(tangents, objective.space.width))
     error = float(objective.error_of(here.rms)[0])
     errors = np.where(slopes.finite, error, np.inf)
     return Linearisation(here.values[..., 0], slopes, here.rms[0], float(here.excess[0]), errors)
+
+
+def _tethered(objective: Objective, descent: Descent, slopes: Slopes) -> Slopes:
+    """Slopes of a descent's residuals, with those of its tether below."""
+    space, tether = objective.space, descent.restriction.tether
+    if tether is None:
+        return slopes
+    shift = _OF_TETHER * np.diag(space.width)
+    ahead, behind = (tether(space.decode(descent.point.at + way * shift)) for way in (1.0, -1.0))
+    row = np.zeros((len(objective.weights), len(space.width)))
+    row[int(np.argmax(objective.weights))] = (ahead - behind) / (2.0 * _OF_TETHER)
+    return joined(slopes, row)
 
 
 def _responses(

@@ -11,6 +11,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray, IntArray
 
 _ROWS = 1024  # that are made orthogonal at once
+_ROUNDING = 1e-15  # part of the largest eigenvalue, below which others are sums' rounding
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,34 @@ class Slopes:
             parts.append(wide)
         triangle = triangle_of(np.concatenate([*parts, np.zeros((n + 1, n + 1))]))
         return triangle[:n, :n], triangle[:n, n]
+
+    def root(self, residual: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Other R and q of the same, from sums of products; takes a fifth of the time.
+
+        What is told by less than 1e-8 of the most, column by column, is lost: enough for slopes by
+        differences, which know no more.
+        """
+        hessian, slope = self._products(residual, c)
+        if not np.isfinite(hessian).all():
+            hessian, slope = self.without(~self.finite)._products(residual, c)
+        size = np.sqrt(np.diag(hessian))
+        size = np.where(size > 0.0, size, 1.0)
+        values, axes = np.linalg.eigh(hessian / np.outer(size, size))
+        roots = np.sqrt(np.where(values > _ROUNDING * values[-1], values, 0.0))
+        back = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0.0)
+        return (roots * axes).T * size, back * ((slope / size) @ axes)
+
+    def _products(self, residual: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """sum_j c_j J_j'J_j, (n_free, n_free), and sum_j c_j J_j'e_j, (n_free,)."""
+        hessian, slope = np.zeros((self.n_free, self.n_free)), np.zeros(self.n_free)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for block in self.blocks:
+                for j in np.flatnonzero(c > 0.0).tolist():
+                    values = block.values[:, j]
+                    across = c[j] * values.T
+                    hessian[np.ix_(block.columns, block.columns)] += across @ values
+                    slope[block.columns] += across @ residual[block.rows, j]
+        return hessian, slope
 
     def along(self, steps: FloatArray, output: int) -> FloatArray:
         """Changes J_j d of an output's residuals by steps d, (n, n_free): (n, n_residuals)."""

@@ -152,6 +152,14 @@ class SearchSpace:
         estimated = tuple((record - place, state) for record, state in self.estimated)
         return replace(self, estimated=estimated)
 
+    def starts_by_record(self, n_records: int) -> list[list[tuple[int, int]]]:
+        """Coordinate and state of each estimated initial state, for each of the records."""
+        starts: list[list[tuple[int, int]]] = [[] for _ in range(n_records)]
+        for column, (record, state) in enumerate(self.estimated, len(self.index)):
+            if 0 <= record < n_records:
+                starts[record].append((column, state))
+        return starts
+
     def with_nominal_starts(self, chromosomes: FloatArray) -> FloatArray:
         """Chromosomes of the parameters alone, completed by where the states start otherwise."""
         begin = [parameter.nominal for parameter in self.parameters[len(self.index) :]]

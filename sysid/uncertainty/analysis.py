@@ -670,8 +670,8 @@ class _Analysis:
 
     def doubted(self, drafts: Sequence[_Draft]) -> BoolArray:
         """Which drafts' intervals, (n,), simulations refuse at the ends that slopes tell."""
-        by_slopes = ((i, d) for i, d in enumerate(drafts) if d.estimate.std is not None)
-        tracers = {i: draft.tracer for i, draft in by_slopes if draft.tracer}
+        narrow = ((i, d) for i, d in enumerate(drafts) if d.estimate.std and not d.wide)
+        tracers = {i: draft.tracer for i, draft in narrow if draft.tracer}
         doubted = np.zeros(len(drafts), dtype=bool)
         doubted[[*tracers]] = ~np.array(self._ends.as_foretold([*tracers.values()]), dtype=bool)
         return doubted

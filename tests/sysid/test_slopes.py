@@ -36,6 +36,28 @@ def test_the_triangle_is_that_of_all_rows(seed, c):
     np.testing.assert_allclose(root.T @ right / scale, push, atol=1e-10 * np.abs(push).max())
 
 
+@given(seed=st.integers(0, 1000), c=st.tuples(st.floats(0.1, 10.0), st.floats(0.0, 10.0)))
+def test_sums_of_products_tell_the_same(seed, c):
+    slopes, residual = drawn(seed)
+    triangle, toward = slopes.triangle(residual, np.array(c))
+    root, right = slopes.root(residual, np.array(c))
+    scale = np.linalg.norm(triangle, axis=0)
+    np.testing.assert_allclose(
+        root.T @ root / np.outer(scale, scale), triangle.T @ triangle / np.outer(scale, scale),
+        atol=1e-12,
+    )  # fmt: skip
+    push = triangle.T @ toward / scale
+    np.testing.assert_allclose(root.T @ right / scale, push, atol=1e-10 * np.abs(push).max())
+
+
+def test_of_a_tie_sums_of_products_tell_nothing():
+    values = np.random.default_rng(4).standard_normal((50, 1, 3))
+    values[..., 2] = 2.0 * values[..., 0] - values[..., 1]
+    root, right = Slopes.of(values).root(values[:, :, 0].copy(), np.ones(1))
+    assert np.flatnonzero(root.any(axis=1)).tolist() == [1, 2]
+    assert right[0] == 0.0
+
+
 def test_products_are_those_of_all_rows():
     slopes, residual = drawn(1)
     rng = np.random.default_rng(2)
@@ -52,8 +74,8 @@ def test_what_is_no_number_counts_as_nothing_and_is_told():
     slopes.blocks[1].values[5, 0, 1] = np.nan
     slopes.blocks[2].values[0, 1, -1] = np.inf
     assert np.flatnonzero(~slopes.finite).tolist() == [1, 8]
-    root, _ = slopes.triangle(residual, np.ones(2))
-    assert np.isfinite(root).all()
+    for way in (slopes.triangle, slopes.root):
+        assert np.isfinite(np.concatenate([*map(np.ravel, way(residual, np.ones(2)))])).all()
     none = slopes.without(~slopes.finite)
     assert none.finite.all()
     assert not none.dense[..., [1, 8]].any() and none.dense[..., 0] == pytest.approx(
