@@ -109,7 +109,7 @@ class BatchSimulator:
         self.threads = threads or available_cores()
         self.max_steps = max_steps
         self._kernels = kernels(model)
-        self._workers = Workers(self.threads)
+        self.workers = Workers(self.threads)
         self._records: dict[tuple[int, bytes], RecordSimulator] = {}
 
     def finer(self, accuracy: float) -> BatchSimulator:
@@ -348,7 +348,7 @@ class BatchSimulator:
             part = simulator.tangents(lanes[rows], from_starts[rows], steps)
             values[r][..., rows] = part if scales is None else part * simulator.weights[..., None]
 
-        self._workers.each(run, tasks)
+        self.workers.each(run, tasks)
         return [
             np.moveaxis(value.reshape(*value.shape[:2], n, n_directions), 2, 0) for value in values
         ]
@@ -396,8 +396,8 @@ class BatchSimulator:
             part[..., again] = part[..., first[again]]
             sse[again, r], excess[again, r] = sse[first[again], r], excess[first[again], r]
 
-        self._workers.each(run, tasks)
-        self._workers.each(copy, copies)
+        self.workers.each(run, tasks)
+        self.workers.each(copy, copies)
         return Residuals(values, sse, excess)
 
     def steps_needed(
@@ -414,7 +414,7 @@ class BatchSimulator:
         def needed(place: int) -> IntArray:
             return self.steps_of_each(parameters, records[place], starts[place])
 
-        return np.stack(self._workers.results(needed, range(len(records))), axis=1)
+        return np.stack(self.workers.results(needed, range(len(records))), axis=1)
 
     def steps_of_each(
         self, parameters: FloatArray, record: Dataset, starts: FloatArray | None = None
@@ -432,7 +432,7 @@ class BatchSimulator:
             if len(self._records) >= _MOST_RECORDS:
                 self._records.clear()
             simulator = RecordSimulator(
-                self._kernels, record, scale, self.accuracy, self.max_steps, self._workers
+                self._kernels, record, scale, self.accuracy, self.max_steps, self.workers
             )
             # It holds the record, whose address stays its own as long.
             self._records[key] = simulator

@@ -239,22 +239,26 @@ class Objective:
         """The same objective with exact slopes, if its equations can be differentiated."""
         return self._with(exact_slopes=is_differentiable(self.simulator.model))
 
-    def tangents(self, chromosomes: FloatArray, n_steps: IntArray) -> list[tuple[SlopeBlock, ...]]:
+    def tangents(
+        self, chromosomes: FloatArray, n_steps: IntArray, unit: FloatArray | float = 1.0
+    ) -> list[Slopes]:
         """Slopes of the residuals of free runs by search coordinates, through the steps exact.
 
-        n_steps: (n, n_records). For each chromosome a block a record, as of ``residuals``.
+        n_steps: (n, n_records). unit: (n_free,), moves of the coordinates that they are by. For
+        each chromosome a block a record, as of ``residuals``.
         """
         space, model = self.space, self.simulator.model
+        unit = np.broadcast_to(unit, len(space.parameters))
         n, shared = len(chromosomes), len(space.index)
         starts = space.starts_by_record(len(self.records))
         most = max(map(len, starts), default=0)
         along = np.zeros((n, shared + most, len(model.parameters)))
-        along[:, :shared] = space.directions(chromosomes)
+        along[:, :shared] = space.directions(chromosomes) * unit[:shared, None]
         moves = [np.zeros((n, shared + most, len(model.states))) for _ in self.records]
         for move, places in zip(moves, starts, strict=True):
             for i, (column, state) in enumerate(places):
                 increments = chromosomes[:, column] if space.log[column] else 1.0
-                move[:, shared + i, state] = increments
+                move[:, shared + i, state] = increments * unit[column]
         parts = self.simulator.tangents(
             space.full(chromosomes), self.records, along, n_steps, self._starts(chromosomes),
             moves, self.scales,
@@ -266,7 +270,10 @@ class Objective:
             columns = np.array([*range(shared), *(column for column, _ in places)], dtype=np.int64)
             of_records.append((rows, columns, part[..., : len(columns)]))
         return [
-            tuple(SlopeBlock(rows, columns, part[k]) for rows, columns, part in of_records)
+            Slopes(
+                tuple(SlopeBlock(rows, columns, part[k]) for rows, columns, part in of_records),
+                len(space.parameters),
+            )
             for k in range(n)
         ]
 
@@ -281,10 +288,11 @@ class Objective:
         return replace(responses, values=values, rms=rms)
 
     def shifted(self, responses: Responses, shift: FloatArray) -> Responses:
-        """Responses with residuals that are more by (n_residuals, n_outputs)."""
-        values = responses.values + shift[..., None]
+        """The same responses, their residuals more by (n_residuals, n_outputs)."""
+        values = responses.values
+        values += shift[..., None]
         with np.errstate(over="ignore", invalid="ignore"):  # where a simulation failed
-            rms = self._roots(np.sum(values**2, axis=0).T)
+            rms = self._roots(np.einsum("tin,tin->ni", values, values))
         return replace(responses, values=values, rms=np.where(np.isfinite(rms), rms, np.inf))
 
     def steps_needed(self, chromosomes: FloatArray) -> IntArray:

@@ -22,8 +22,10 @@ squares", Quarterly of Applied Mathematics 2, 1944) as scaled by Marquardt (1963
 course depends on nothing but itself, whatever others share its batches.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -51,7 +53,7 @@ from sysid.fitting.quadratic import (
     heavier,
     restored,
 )
-from sysid.fitting.slopes import SlopeBlock, Slopes, joined, scaled
+from sysid.fitting.slopes import Slopes, joined
 from sysid.problem.space import SearchSpace
 
 MOST_ITERATIONS = 50
@@ -62,7 +64,10 @@ _LITTLE = 0.5  # share of the promise below which the valley bends
 _FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
 _BURST = 10.0  # a neighbour's error that is so much larger has left the edge of stability
 _OF_TETHER = 1e-6  # parts of the ranges, of differences that a tether's slopes are by
+_LONG = 200_000  # slopes, from where on threads take less time than they lose to each other
 _BATCH_BYTES = 2**28  # residuals held at once, unless one descent needs more
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -219,7 +224,7 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents, whose integration steps are chosen, after one iteration."""
     space = objective.space
     around = _linearised(objective, descents)
-    surveys = [_surveyed(objective, *pair) for pair in zip(descents, around, strict=True)]
+    surveys = _side_by_side(objective, _surveyed, [*zip(descents, around, strict=True)])
     onward = [descent for descent, _ in surveys]
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
     at = np.array([onward[i].point.at for i in quadratics])
@@ -236,9 +241,8 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
             onward[i] = resumed(objective, onward[i], "arrived")
     rows = [offer.coordinates for offer in offers.values()]
     tried = dict(zip(offers, _responses(objective, [onward[i] for i in offers], rows), strict=True))
-    curved = {
-        i: (restored if objective.exact_slopes else bent)(
-            objective,
+    behind = {
+        i: (
             onward[i].point.at,
             onward[i].restriction.bounds(space),
             quadratics[i],
@@ -249,6 +253,8 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
         for i, offer in offers.items()
         if _gains(objective, onward[i], tried[i]).max() < _LITTLE * offer.promise
     }
+    way = restored if objective.exact_slopes else bent
+    curved = dict(zip(behind, _side_by_side(objective, way, [*behind.values()]), strict=True))
     rows = [offer.coordinates for offer in curved.values()]
     again = _responses(objective, [onward[i] for i in curved], rows, keep=False)
     for i, responses in zip(curved, again, strict=True):
@@ -256,6 +262,15 @@ def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     for i, offer in offers.items():
         onward[i] = _judged(objective, onward[i], offer, tried[i])
     return onward
+
+
+def _side_by_side(
+    objective: Objective, function: Callable[..., _Result], tasks: Sequence[tuple[Any, ...]]
+) -> list[_Result]:
+    """What a function of the objective returns of each task, in threads where that takes long."""
+    if objective.n_residuals * len(objective.space.parameters) < _LONG:
+        return [function(objective, *task) for task in tasks]
+    return objective.simulator.workers.results(lambda task: function(objective, *task), tasks)
 
 
 def _surveyed(
@@ -403,15 +418,13 @@ def _linearised(objective: Objective, descents: list[Descent]) -> list[Linearisa
             for descent, distance in zip(descents, distances, strict=True)
         ]
         around = _responses(objective, descents, rows)
-        return [
-            _by_differences(objective, neighbours, *each)
-            for each in zip(descents, around, distances, strict=True)
-        ]
+        whole = zip(itertools.repeat(neighbours), descents, around, distances, strict=False)
+        return _side_by_side(objective, _by_differences, [*whole])
     rows = [descent.point.at[None] for descent in descents]
     steps = np.array([descent.steps for descent in descents])
-    tangents = objective.tangents(space.decode(np.concatenate(rows)), steps)
+    tangents = objective.tangents(space.decode(np.concatenate(rows)), steps, space.width)
     here = _responses(objective, descents, rows)
-    return [_by_tangents(objective, *each) for each in zip(descents, here, tangents, strict=True)]
+    return _side_by_side(objective, _by_tangents, [*zip(descents, here, tangents, strict=True)])
 
 
 def _by_differences(
@@ -429,10 +442,10 @@ def _by_differences(
 
 
 def _by_tangents(
-    objective: Objective, descent: Descent, here: Responses, tangents: tuple[SlopeBlock, ...]
+    objective: Objective, descent: Descent, here: Responses, tangents: Slopes
 ) -> Linearisation:
-    """tangents: by the search coordinates."""
-    slopes = _tethered(objective, descent, scaled(tangents, objective.space.width))
+    """tangents: by the search coordinates, in parts of the ranges."""
+    slopes = _tethered(objective, descent, tangents)
     error = float(objective.error_of(here.rms)[0])
     errors = np.where(slopes.finite, error, np.inf)
     return Linearisation(here.values[..., 0], slopes, here.rms[0], float(here.excess[0]), errors)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -160,12 +159,3 @@ def joined(slopes: Slopes, row: FloatArray) -> Slopes:
     first = slopes.blocks[-1].rows.stop
     last = SlopeBlock(slice(first, first + 1), np.arange(slopes.n_free), row[None])
     return Slopes((*slopes.blocks, last), slopes.n_free)
-
-
-def scaled(parts: Sequence[SlopeBlock], sizes: FloatArray) -> Slopes:
-    """Slopes of blocks in parts of the coordinates' sizes, (n_free,)."""
-    blocks = (
-        SlopeBlock(block.rows, block.columns, block.values * sizes[block.columns])
-        for block in parts
-    )
-    return Slopes(tuple(blocks), len(sizes))

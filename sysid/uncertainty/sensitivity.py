@@ -11,7 +11,6 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.averages import just_missed
 from sysid.fitting.innovations import Innovations, filters
 from sysid.fitting.objective import Objective
-from sysid.fitting.slopes import Slopes
 from sysid.problem.data import Dataset
 from sysid.uncertainty.colour import record_rows
 
@@ -142,7 +141,7 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
 def _by_tangents(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     steps = objective.steps_needed(chromosome[None])
     residual = objective.residuals(chromosome[None], steps).values[..., 0]
-    slopes = Slopes(objective.tangents(chromosome[None], steps)[0], len(chromosome)).dense
+    slopes = objective.tangents(chromosome[None], steps)[0].dense
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
     failing = np.zeros(len(chromosome), dtype=bool)
     return Sensitivity(

@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid import Constraint, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.engine.simulation import BatchResult, Residuals
+from sysid.threads import Workers
 
 
 def outputs_of(model, x, u, p):
@@ -183,7 +184,7 @@ class Formula:
     accuracy = 1e-10
 
     def __init__(self, model, formula):
-        self.model, self.formula = model, formula
+        self.model, self.formula, self.workers = model, formula, Workers(2)
 
     def steps_of_each(self, vectors, record):
         return np.ones(len(vectors), dtype=int)

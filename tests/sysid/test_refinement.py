@@ -19,6 +19,7 @@ from sysid import (
     State,
 )
 from sysid.fitting import descent as stalls
+from sysid.fitting import refinement
 from sysid.fitting.descent import PERTURBATIONS, Descent, Point
 from sysid.fitting.objective import FLOORS, Objective
 from sysid.fitting.refinement import (
@@ -624,3 +625,26 @@ def test_a_descent_ends_on_its_safe_point_when_patience_does():
     once = stalls.retreat(None, descent)
     assert once.point is safe and not once.finished and once.damping > descent.damping
     assert stalls.retreat(None, once).finished
+
+
+def test_in_threads_descents_go_the_same_way(monkeypatch):
+    """What takes long is done by several of them, each descent's by one."""
+    record, simulator = motor_record(), BatchSimulator(motor(), threads=2)
+    objective = Objective(simulator, SearchSpace.of(motor()), [record])
+    rng = np.random.default_rng(8)
+    starts = draw(motor(), rng, 5)[:, objective.space.index]
+    tasks = []
+
+    def ends(long):
+        monkeypatch.setattr(refinement, "_LONG", long)
+        return refine_each(objective, [begin(objective, start) for start in starts], 6)
+
+    alone = ends(np.inf)
+    kept = simulator.workers.results
+    monkeypatch.setattr(
+        simulator.workers, "results", lambda f, each: tasks.append(len(each)) or kept(f, each)
+    )
+    for one, other in zip(alone, ends(0), strict=True):
+        np.testing.assert_array_equal(one.chromosome, other.chromosome)
+        assert (one.error, one.iterations) == (other.error, other.iterations)
+    assert max(tasks) == len(starts)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid.fitting.slopes import SlopeBlock, Slopes, joined, scaled
+from sysid.fitting.slopes import SlopeBlock, Slopes, joined
 
 
 def drawn(seed, lengths=(700, 1500, 30), shared=3, own=2, q=2):
@@ -84,11 +84,9 @@ def test_what_is_no_number_counts_as_nothing_and_is_told():
     assert not none.triangle(residual, np.ones(2))[0][:, [1, 8]].any()
 
 
-def test_a_row_more_and_other_sizes():
+def test_a_row_more():
     slopes, _ = drawn(4)
     row = np.arange(18.0).reshape(2, 9)
     np.testing.assert_array_equal(
         joined(slopes, row).dense, np.concatenate([slopes.dense, row[None]])
     )
-    sizes = np.arange(1.0, 10.0)
-    np.testing.assert_array_equal(scaled(slopes.blocks, sizes).dense, slopes.dense * sizes)

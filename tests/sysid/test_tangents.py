@@ -19,7 +19,6 @@ from sysid import (
     State,
 )
 from sysid.fitting.objective import Objective
-from sysid.fitting.slopes import Slopes
 from tests.sysid.support import blank
 
 DT = 0.01
@@ -210,7 +209,7 @@ def test_slopes_of_residuals_are_those_of_differences():
     objective = Objective(BatchSimulator(model), space, records)
     at = space.encode(np.array([*VALUES.values(), 0.3, -0.2]))
     steps = np.array([[2, 3]])
-    exact = Slopes(objective.tangents(space.decode(at[None]), steps)[0], len(at)).dense
+    exact = objective.tangents(space.decode(at[None]), steps)[0].dense
     shift = 1e-5 * np.eye(len(at))
     ahead, behind = (
         objective.residuals(space.decode(at + way * shift), steps[0]).values for way in (1.0, -1.0)
@@ -218,3 +217,6 @@ def test_slopes_of_residuals_are_those_of_differences():
     differences = (ahead - behind) / 2e-5
     assert exact == pytest.approx(differences, abs=1e-7 * np.abs(differences).max())
     assert not exact[7:9, 1].any() and not exact[:n, :, -1].any() and exact[n:, :, -1].any()
+    unit = np.arange(1.0, 1.0 + len(at))
+    (longer,) = objective.tangents(space.decode(at[None]), steps, unit)
+    assert longer.dense == pytest.approx(exact * unit, rel=1e-12)
