@@ -35,13 +35,15 @@ _STEPS = 8  # back into a valley
 _SETTLED = 0.01  # of the root of the statistic, below which a step back does not matter any more
 # The root of the statistic in parts of that of its level, where an interval ends as it should.
 _LEAST, _MOST = 0.93, 1.2
+_NOWHERE = 1e-6  # deviations from the estimate
 
 
 @dataclass(frozen=True)
 class _End:
     """Search coordinates (n_free,) of an end of an interval, of which of them, and what is there.
 
-    root: of the statistic, in parts of its level's.
+    root: of the statistic, in parts of what it is to be where the quantity is: combinations are not
+    quite where their slopes lead.
     """
 
     place: int
@@ -111,7 +113,8 @@ class SimulatedEnds:
         onward = []
         for i, loss, values in zip(batch, losses, np.moveaxis(responses.values, 2, 0), strict=True):
             end, tracer = ends[i], tracers[ends[i].place]
-            root = float(np.sqrt(tracer.statistic(float(loss)))) / Z95
+            far = abs(tracer.quantity.at(end.point) - tracer.centre) / tracer.unit
+            root = float(np.sqrt(tracer.statistic(float(loss)))) / max(far, _NOWHERE)
             settled = bool(abs(end.root - root) <= _SETTLED * root)
             point = end.point
             if np.isfinite(root) and not settled:

@@ -522,6 +522,23 @@ def test_slopes_tell_an_interval_where_simulations_agree(steep, bend, by_slopes)
     assert (a.low - 2.0, a.high - 2.0) == pytest.approx(ends, abs=0.1 * half)
 
 
+@pytest.mark.parametrize("sigma", [2.0, 10.0], ids=["narrow", "wide"])
+def test_a_wide_interval_of_a_sum_is_no_product_s(sigma):
+    """By its logarithm the interval of a wide one would reach too far above, and not below."""
+    problem = Problem(
+        lambda p, u: columns((p["a"] + p["b"]) * u[:, 0]), [unknown("a", 1.5), unknown("b", 0.5)],
+        sigma=sigma,
+    )  # fmt: skip
+    total = Formulated("a + b", ("a", "b"), lambda a, b: a + b)
+    told = combinations(problem.tell(total))["a + b"]
+    (record,) = problem.records
+    u, y = record.inputs[:, 0], record.outputs[:, 0]
+    value = float(u @ y / (u @ u))
+    half = Z95 * float(np.std(y - value * u)) / math.sqrt(float(u @ u))
+    assert (half > 0.2 * value) is (sigma > 5.0)
+    assert (told.low, told.high) == pytest.approx((value - half, value + half), abs=0.08 * half)
+
+
 def same_interval(one, other):
     assert one.value == pytest.approx(other.value, rel=1e-4)
     assert (one.low, one.high) == pytest.approx((other.low, other.high), rel=1e-4)
