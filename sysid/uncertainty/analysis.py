@@ -306,6 +306,12 @@ class _Draft:
     traced: bool = False
     wide: bool = False
 
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Its two ends, where it has them."""
+        low, high = self.estimate.low, self.estimate.high
+        return None if low is None or high is None else (low, high)
+
     def without_interval(self) -> Self:
         """The same, of which slopes tell nothing."""
         return replace(self, estimate=replace(self.estimate, std=None, low=None, high=None))
@@ -681,10 +687,13 @@ class _Analysis:
 
         Of what is doubted, and of what is so wide that slopes alone are no guide.
         """
-        wanted = ((i, d) for i, d in enumerate(drafts) if doubted[i] or d.wide)
-        tracers = {i: draft.tracer for i, draft in wanted if draft.tracer}
-        kept = self._ends.at_the_level([*tracers.values()])
-        refused = {i for i, is_kept in zip(tracers, kept, strict=True) if not is_kept}
+        intervals = {
+            i: (draft.tracer, draft.interval)
+            for i, draft in enumerate(drafts)
+            if draft.tracer and draft.interval and (doubted[i] or draft.wide)
+        }
+        kept = self._ends.at_the_level([*intervals.values()])
+        refused = {i for i, is_kept in zip(intervals, kept, strict=True) if not is_kept}
         return [d.without_interval() if i in refused else d for i, d in enumerate(drafts)]
 
     @cached_property

@@ -35,19 +35,20 @@ _STEPS = 8  # back into a valley
 _SETTLED = 0.01  # of the root of the statistic, below which a step back does not matter any more
 # The root of the statistic in parts of that of its level, where an interval ends as it should.
 _LEAST, _MOST = 0.93, 1.2
-_NOWHERE = 1e-6  # deviations from the estimate
+_NOWHERE = 1e-6  # of the way to an end
 
 
 @dataclass(frozen=True)
 class _End:
     """Search coordinates (n_free,) of an end of an interval, of which of them, and what is there.
 
-    root: of the statistic, in parts of what it is to be where the quantity is: combinations are not
-    quite where their slopes lead.
+    edge: where the interval ends. root: of the statistic, in parts of what it is to be where the
+    quantity is, since combinations are not quite where their slopes lead.
     """
 
     place: int
     point: FloatArray
+    edge: float = np.nan
     root: float = np.inf
     settled: bool = False
 
@@ -82,13 +83,18 @@ class SimulatedEnds:
                 alike[end.place] &= 1.0 / _UNLIKE < share < _UNLIKE
         return alike
 
-    def at_the_level(self, tracers: Sequence[Tracer]) -> list[bool]:
+    def at_the_level(self, intervals: Sequence[tuple[Tracer, tuple[float, float]]]) -> list[bool]:
         """Whether the profile, led to as by chords, is about at its level at both ends.
 
-        Coordinates on an end of their range stay there.
+        intervals: of tracers' quantities. Coordinates on an end of their range stay there.
         """
-        ends = [_End(i, point) for i, tracer in enumerate(tracers) for point in self._ends(tracer)]
-        alike = [True] * len(tracers)
+        tracers = [tracer for tracer, _ in intervals]
+        ends = [
+            _End(i, point, edge)
+            for i, (tracer, interval) in enumerate(intervals)
+            for point, edge in zip(self._ends(tracer), interval, strict=True)
+        ]
+        alike = [True] * len(intervals)
         for end in ends:
             alike[end.place] &= self._is_inside(end.point)
         for _ in range(1 + _STEPS):
@@ -113,8 +119,9 @@ class SimulatedEnds:
         onward = []
         for i, loss, values in zip(batch, losses, np.moveaxis(responses.values, 2, 0), strict=True):
             end, tracer = ends[i], tracers[ends[i].place]
-            far = abs(tracer.quantity.at(end.point) - tracer.centre) / tracer.unit
-            root = float(np.sqrt(tracer.statistic(float(loss)))) / max(far, _NOWHERE)
+            value, quantity = tracer.quantity.value(tracer.centre), tracer.quantity
+            far = (quantity.value(quantity.at(end.point)) - value) / (end.edge - value)
+            root = float(np.sqrt(tracer.statistic(float(loss)))) / Z95 / max(far, _NOWHERE)
             settled = bool(abs(end.root - root) <= _SETTLED * root)
             point = end.point
             if np.isfinite(root) and not settled:

@@ -523,20 +523,25 @@ def test_slopes_tell_an_interval_where_simulations_agree(steep, bend, by_slopes)
 
 
 @pytest.mark.parametrize("sigma", [2.0, 10.0], ids=["narrow", "wide"])
-def test_a_wide_interval_of_a_sum_is_no_product_s(sigma):
-    """By its logarithm the interval of a wide one would reach too far above, and not below."""
+@pytest.mark.parametrize("names", ["a", "ab"])
+def test_a_wide_interval_is_not_left_to_a_logarithm_s_slope(names, sigma):
+    """That of a, or of a + b, is as wide below as above, which that of its logarithm is not."""
     problem = Problem(
-        lambda p, u: columns((p["a"] + p["b"]) * u[:, 0]), [unknown("a", 1.5), unknown("b", 0.5)],
+        lambda p, u: columns(sum(p[name] for name in names) * u[:, 0]),
+        [unknown(name, 2.0 / len(names)) for name in names],
         sigma=sigma,
-    )  # fmt: skip
+    )
     total = Formulated("a + b", ("a", "b"), lambda a, b: a + b)
-    told = combinations(problem.tell(total))["a + b"]
+    found = problem.tell(total) if len(names) > 1 else problem.tell()
+    (quantity,) = combinations(found).values() if len(names) > 1 else found.parameters
     (record,) = problem.records
     u, y = record.inputs[:, 0], record.outputs[:, 0]
     value = float(u @ y / (u @ u))
     half = Z95 * float(np.std(y - value * u)) / math.sqrt(float(u @ u))
     assert (half > 0.2 * value) is (sigma > 5.0)
-    assert (told.low, told.high) == pytest.approx((value - half, value + half), abs=0.08 * half)
+    assert (quantity.low, quantity.high) == pytest.approx(
+        (value - half, value + half), abs=0.08 * half
+    )
 
 
 def same_interval(one, other):
