@@ -310,9 +310,9 @@ def _failed_runs(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
 def _validation_errors(
     model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
 ) -> list[tuple[str, float, float, bool]]:
-    """Of each output: error in validation in parts of that in training, and by how much it is
+    """Of each output its name, its error in validation in parts of that in training, and two more:
 
-    beyond that, in parts of the output's deviation; whether it is that of the noise alone.
+    by how much it is larger, in parts of the output's deviation; whether it is noise alone.
     """
     if not validation:
         return []
