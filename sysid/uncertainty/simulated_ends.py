@@ -119,9 +119,7 @@ class SimulatedEnds:
         onward = []
         for i, loss, values in zip(batch, losses, np.moveaxis(responses.values, 2, 0), strict=True):
             end, tracer = ends[i], tracers[ends[i].place]
-            value, quantity = tracer.quantity.value(tracer.centre), tracer.quantity
-            far = (quantity.value(quantity.at(end.point)) - value) / (end.edge - value)
-            root = float(np.sqrt(tracer.statistic(float(loss)))) / Z95 / max(far, _NOWHERE)
+            root = float(np.sqrt(tracer.statistic(float(loss)))) / Z95 / self._share(tracer, end)
             settled = bool(abs(end.root - root) <= _SETTLED * root)
             point = end.point
             if np.isfinite(root) and not settled:
@@ -137,6 +135,13 @@ class SimulatedEnds:
         step, across = -inverse @ push, inverse @ gradient
         kept: FloatArray = step - across * (gradient @ step) / (gradient @ across)
         return kept * width
+
+    def _share(self, tracer: Tracer, end: _End) -> float:
+        """How far the quantity is on its way to where the interval ends."""
+        quantity = tracer.quantity
+        value, there = quantity.value(tracer.centre), quantity.value(quantity.at(end.point))
+        way = end.edge - value
+        return max((there - value) / way, _NOWHERE) if way else _NOWHERE
 
     @cached_property
     def _weighted(self) -> FloatArray:
@@ -169,7 +174,8 @@ class SimulatedEnds:
     def _ends(self, tracer: Tracer) -> list[FloatArray]:
         """Search coordinates (n_free,) of both ends, what is on an end of its range left there."""
         along, gradient = self._along(tracer) * ~self.on_bound, tracer.gradient
-        far = Z95 * self.covariance.deviation(gradient) / float(gradient @ along)
+        moved, deviation = float(gradient @ along), self.covariance.deviation(gradient)
+        far = Z95 * deviation / moved if moved > 0.0 else np.nan  # all of it is on such an end
         at = self.local.objective.space.encode(self.local.chromosome)
         return [at + sign * far * along for sign in _SIDES]
 
