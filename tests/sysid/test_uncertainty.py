@@ -1162,6 +1162,15 @@ def test_all_intervals_together_hold_as_often_as_independent_ones():
     assert result.simultaneous == pytest.approx(quantile / Z, abs=0.02)
 
 
+def test_intervals_that_nobody_asks_for_do_not_count_among_all():
+    """Neither starts of parts of a log, nor what they are in."""
+    objective = LINEAR.objective()
+    end = refine(objective, TRUTH).chromosome
+    result = uncertainty(objective, end, profiled=[0, 1])
+    assert result.joint == pytest.approx(0.95**2, abs=0.015)
+    assert all(e.std is not None for e in result.parameters)
+
+
 def test_an_output_that_does_not_count_determines_nothing():
     problem = Problem(
         lambda p, u: columns(p["a"] * u[:, 0], p["b"] * u[:, 1]),
