@@ -316,6 +316,10 @@ class _Draft:
         """The same, of which slopes tell nothing."""
         return replace(self, estimate=replace(self.estimate, std=None, low=None, high=None))
 
+    def as_traced(self) -> Self:
+        """The same, its ends those of its profile."""
+        return replace(self, estimate=replace(self.estimate, std=None), traced=True)
+
     def searches(self, fits: Sequence[Fit]) -> dict[float, Fit | None]:
         """Sides on which the profile is to be searched, and the fits to go on from."""
         if self.tracer is None:
@@ -685,7 +689,8 @@ class _Analysis:
     def confirmed(self, drafts: Sequence[_Draft], doubted: BoolArray) -> list[_Draft]:
         """Drafts without intervals that slopes tell and profiles would not.
 
-        Of what is doubted, and of what is so wide that slopes alone are no guide.
+        Of what is doubted, and of what is so wide that slopes alone are no guide; what is kept of
+        the latter counts as its profile's.
         """
         intervals = {
             i: (draft.tracer, draft.interval)
@@ -694,7 +699,10 @@ class _Analysis:
         }
         kept = self._ends.at_the_level([*intervals.values()])
         refused = {i for i, is_kept in zip(intervals, kept, strict=True) if not is_kept}
-        return [d.without_interval() if i in refused else d for i, d in enumerate(drafts)]
+        return [
+            d.without_interval() if i in refused else d.as_traced() if d.wide else d
+            for i, d in enumerate(drafts)
+        ]
 
     @cached_property
     def _ends(self) -> SimulatedEnds:
