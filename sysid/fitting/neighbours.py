@@ -31,17 +31,12 @@ class Neighbours:
     @classmethod
     def of(cls, objective: Objective) -> Self:
         """Those of an objective, as few as there may be."""
-        space = objective.space
-        shared, n_free = len(space.index), len(space.parameters)
-        places = np.arange(n_free)
-        starts = space.starts_by_record(len(objective.records))
-        if max(map(len, starts), default=0) == n_free - shared:
+        shared, n_free = len(objective.space.index), len(objective.space.parameters)
+        places, blocks = np.arange(n_free), objective.blocks
+        if max(len(columns) for _, columns in blocks) == n_free:
             return cls(places)
-        end, blocks = 0, []
-        for record, its in zip(objective.records, starts, strict=True):
-            columns = np.array([*range(shared), *(column for column, _ in its)], dtype=np.int64)
-            places[columns[shared:]] = shared + np.arange(len(its))
-            blocks.append((slice(end, end := end + record.n_samples), columns))
+        for _, columns in blocks:
+            places[columns[shared:]] = np.arange(shared, len(columns))
         return cls(places, tuple(blocks))
 
     @property

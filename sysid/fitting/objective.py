@@ -264,18 +264,27 @@ class Objective:
             moves, self.scales,
         )  # fmt: skip
         self._counter[0] += n * (shared + most)
-        end, of_records = 0, []
-        for part, places in zip(parts, starts, strict=True):
-            rows = slice(end, end := end + part.shape[1])
-            columns = np.array([*range(shared), *(column for column, _ in places)], dtype=np.int64)
-            of_records.append((rows, columns, part[..., : len(columns)]))
+        of_records = [*zip(self.blocks, parts, strict=True)]
         return [
             Slopes(
-                tuple(SlopeBlock(rows, columns, part[k]) for rows, columns, part in of_records),
+                tuple(
+                    SlopeBlock(rows, columns, part[k, ..., : len(columns)])
+                    for (rows, columns), part in of_records
+                ),
                 len(space.parameters),
             )
             for k in range(n)
         ]
+
+    @property
+    def blocks(self) -> list[tuple[slice, IntArray]]:
+        """Of each record the rows of its residuals, and the search coordinates that act on them."""
+        shared, end, blocks = range(len(self.space.index)), 0, []
+        starts = self.space.starts_by_record(len(self.records))
+        for record, places in zip(self.records, starts, strict=True):
+            columns = np.array([*shared, *(column for column, _ in places)], dtype=np.int64)
+            blocks.append((slice(end, end := end + record.n_samples), columns))
+        return blocks
 
     def with_sample(self, responses: Responses, residual: FloatArray) -> Responses:
         """Responses with one residual more, (n,), as if of the output that counts most."""

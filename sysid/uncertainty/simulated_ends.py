@@ -146,17 +146,28 @@ class SimulatedEnds:
     @cached_property
     def _weighted(self) -> FloatArray:
         """Slopes by their outputs' weights; none of what stays on an end of its range."""
-        weight = self.local.objective.least_squares_weights(self.local.residual)
-        return self.local.slopes * weight[:, None] * ~self.on_bound
+        return self.local.slopes * self._weight[:, None] * ~self.on_bound
+
+    @cached_property
+    def _weight(self) -> FloatArray:
+        """Of the squares of each output's residuals, (n_outputs,)."""
+        return self.local.objective.least_squares_weights(self.local.residual)
+
+    @cached_property
+    def _at(self) -> FloatArray:
+        """The estimate's search coordinates, (n_free,)."""
+        return self.local.objective.space.encode(self.local.chromosome)
 
     @cached_property
     def _inverse(self) -> FloatArray:
         """(H + mu I)^-1 in parts of the ranges, (n_free, n_free)."""
         width = self.local.objective.space.width
-        hessian = np.einsum("tip,tiq->pq", self._weighted, self.local.slopes * ~self.on_bound)
+        n_free = len(width)
+        across = self._weighted.reshape(-1, n_free).T
+        hessian = across @ self.local.slopes.reshape(-1, n_free) * ~self.on_bound
         hessian *= np.outer(width, width)
         mu = _RESTORING * float(np.diag(hessian).max())
-        inverse: FloatArray = np.linalg.inv(hessian + mu * np.eye(len(width))).astype(np.float64)
+        inverse: FloatArray = np.linalg.inv(hessian + mu * np.eye(n_free)).astype(np.float64)
         return inverse
 
     @cached_property
@@ -176,8 +187,7 @@ class SimulatedEnds:
         along, gradient = self._along(tracer) * ~self.on_bound, tracer.gradient
         moved, deviation = float(gradient @ along), self.covariance.deviation(gradient)
         far = Z95 * deviation / moved if moved > 0.0 else np.nan  # all of it is on such an end
-        at = self.local.objective.space.encode(self.local.chromosome)
-        return [at + sign * far * along for sign in _SIDES]
+        return [self._at + sign * far * along for sign in _SIDES]
 
     def _is_inside(self, point: FloatArray) -> bool:
         lower, upper = self.local.objective.space.coded_bounds
@@ -186,11 +196,10 @@ class SimulatedEnds:
     def _shares(self, points: Sequence[FloatArray]) -> FloatArray:
         """Sums of squares by which residuals change, in parts of what slopes foretell, (n,)."""
         local, space = self.local, self.local.objective.space
-        at = space.encode(local.chromosome)
-        rows = space.decode(np.stack([at, *points]))
+        rows = space.decode(np.stack([self._at, *points]))
         values = local.objective.residuals(rows, local.steps).values
-        weight = local.objective.least_squares_weights(local.residual)[:, None]
-        steps = np.stack(points, axis=1) - at[:, None]
+        weight = self._weight[:, None]
+        steps = np.stack(points, axis=1) - self._at[:, None]
         with np.errstate(all="ignore"):  # where a simulation failed
             changes = np.sum(weight * (values[..., 1:] - values[..., :1]) ** 2, axis=(0, 1))
             shares: FloatArray = changes / np.sum(weight * (local.slopes @ steps) ** 2, axis=(0, 1))
