@@ -24,14 +24,16 @@ class BatchKernel(Scheme):
 
     ``simulate`` runs lanes of chromosomes over a record, ``spectrum`` bounds the fastest rate
     of what is not integrated exactly. The work area holds rows of lanes: states, constants, sums
-    of squared residuals, those of error estimates, and from ``first_row`` on the matrices.
+    of squared residuals, those of error estimates, the residuals of a sample, and from
+    ``first_row`` on the matrices.
     """
 
     def __init__(self, model: ProcessModel, structure: Structure) -> None:
         super().__init__(model, structure)
         self._sums = self.n_states + self.n_constants
         self._estimates = self._sums + self.n_outputs
-        self.first_row = self._estimates + self.n_outputs
+        self._errors = self._estimates + self.n_outputs
+        self.first_row = self._errors + self.n_outputs
         self.work_rows = self.first_row + self.n_entries
 
     def text(self, *, many_registers: bool) -> str:
@@ -48,18 +50,21 @@ class BatchKernel(Scheme):
 
     def _simulate(self, paired: bool) -> str:
         q = self.n_outputs
-        errors = [f"record[k, {j}, l] = (o{j} - y{j}) * w{j}" for j in range(q)]
         squares = [
             line
             for j in range(q)
-            for line in (f"e = (o{j} - y{j}) * w{j}", f"{at(self._sums + j)} += e * e")
+            for line in (
+                f"e = (o{j} - y{j}) * w{j}",
+                f"{at(self._errors + j)} = e",
+                f"{at(self._sums + j)} += e * e",
+            )
         ]
         total = " + ".join(at(self._sums + j) for j in range(q))
         sample = [
             *[f"v{j} = u[k, {j}]" for j in range(self.n_inputs)],
             *[f"{name}{j} = {name}[k, {j}]" for name in "yw" for j in range(q)],
             *block(EACH_LANE, self._outputs(), squares),
-            *block("if record.shape[0] > 0:", block(EACH_LANE, self._outputs(), errors)),
+            *block("if record.shape[0] > 0:", residuals_kept(q, self._errors)),
             *block("if k == n_samples - 1:", ["break"]),
             # A block in which all chromosomes have blown up has nothing more to say.
             *block(
@@ -244,6 +249,11 @@ class BatchKernel(Scheme):
 def at(row: int) -> str:
     """Lane l in a row of the work area."""
     return f"X[{row * LANES} + l]"
+
+
+def residuals_kept(count: int, first: int) -> list[str]:
+    """Rows of the work area from the first on, as many as outputs, kept as those of sample k."""
+    return [f"copy_row(record, k * {count} + {j}, X, {first + j})" for j in range(count)]
 
 
 def _paired(lines: list[str]) -> list[str]:

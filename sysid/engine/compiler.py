@@ -187,6 +187,7 @@ def _compiled(
         **{name: getattr(vector_math, name) for name in vector_math.OF_SLOPES},
         "wide_vectors": intrinsics.wide_vectors,
         "always_inline": intrinsics.always_inline,
+        "copy_row": intrinsics.copy_row,
         "__name__": __name__,  # a module that exists when Numba loads the kernel from its cache
         **{name: machine_code(function) for name, function in called.items()},
     }

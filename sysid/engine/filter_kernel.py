@@ -23,7 +23,7 @@ Chromosomes are lanes, as in the batch kernel.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from sysid.engine.batch_kernel import EACH_LANE, BatchKernel, at
+from sysid.engine.batch_kernel import EACH_LANE, BatchKernel, at, residuals_kept
 from sysid.engine.program import block
 from sysid.engine.scheme import LANES, STEP_SIZES
 from sysid.engine.variation import Cause, Variation
@@ -46,7 +46,10 @@ class FilterKernel(BatchKernel):
 
     Behind the rows of lanes of the batch kernel the work area holds P's upper triangle, of the
     reached states, then of the noisy inputs, then of the averaged outputs at the sample before and
-    then of their sums so far, and the estimates of each noise and of those outputs and sums.
+    then of their sums so far, the estimates of each noise and of those outputs and sums, and
+    measured outputs, then their innovations. Loops over lanes that work out more than a few numbers
+    read and write nothing else: LLVM would have to make sure that no array overlaps another, and
+    leaves what needs many such checks as scalar code.
     """
 
     def __init__(
@@ -77,7 +80,8 @@ class FilterKernel(BatchKernel):
         self.covariance = self.work_rows
         self.noises = self.covariance + len(self.pairs)
         self.before = self.noises + self.n_noises - self.size
-        self.work_rows = self.noises + self.n_noises + 2 * count
+        self.innovation = self.noises + self.n_noises + 2 * count
+        self.work_rows = self.innovation + self.n_measured
 
     def text(self, *, many_registers: bool = False) -> str:
         """Python text of ``innovations``."""
@@ -87,8 +91,12 @@ class FilterKernel(BatchKernel):
             *[f"v{j} = 0.0" for j in range(self.n_recorded, self.n_inputs)],
             *[f"w{j} = w[k, {j}]" for j in outputs],
             *[f"seen{j} = 1.0 if w{j} > 0.0 else 0.0" for j in outputs],
+            *[f"of_output{j} = r[k, {j}]" for j in outputs],
+            *self._weights_of_means(),
             *self._traced("before"),
+            *[f"copy_row(X, {self.innovation + j}, y, k * {q} + {j})" for j in outputs],
             *block(EACH_LANE, self._corrected()),
+            *residuals_kept(q, self.innovation),
             *self._traced("after"),
             *block("if k == n_samples - 1:", ["break"]),
             *self._input_slopes(),
@@ -102,6 +110,10 @@ class FilterKernel(BatchKernel):
             "n_samples = u.shape[0]",
             "h = dt / n_steps",
             *STEP_SIZES,
+            *[f"unit{j} = unit[{j}]" for j in outputs],
+            *[f"of_input{k} = s[{k}]" for k in range(self.n_noises)],
+            *[f"colour{k} = colour[{k}]" for k in range(self.n_noises) if self.coloured],
+            *[f"intensity{k} = intensity[{k}]" for k in range(len(self.variation.driven))],
             *self._begin(),
             *block(EACH_LANE, self._uncertain_start()),
             *block("for k in range(n_samples):", sample),
@@ -125,7 +137,9 @@ class FilterKernel(BatchKernel):
     def _uncertain_start(self) -> list[str]:
         """P before the first sample: ``spread`` of the states, and the noises' variances."""
         n = len(self.reached)
-        variances = {(a, a): f"spread[{a}]" if a < n else f"s[{a - n}]" for a in range(self.size)}
+        variances = {
+            (a, a): f"spread[{a}]" if a < n else f"of_input{a - n}" for a in range(self.size)
+        }
         behind = self.places[n:]
         nothing = [f"{at(self.before + place)} = 0.0" for place in behind]
         return [*self._stored(variances), *nothing]
@@ -180,32 +194,40 @@ class FilterKernel(BatchKernel):
         ]
         return terms, row
 
+    def _weights_of_means(self) -> list[str]:
+        return [
+            f"{name}{of}_{j} = mean[k, {j}, {of}, {i}]"
+            for j in self.lag
+            for of in (_OF_MEAN, _OF_SUM)
+            for i, name in enumerate(_WEIGHTS)
+        ]
+
+    def _innovation(self, j: int) -> str:
+        """Where output j is as measured, and then its innovation."""
+        return at(self.innovation + j)
+
     def _taken_in(self, j: int) -> list[str]:
         """Output j taken in; the deviation d is what the sample's outputs have changed so far."""
         gains, size, lines = self._gains(j), self.places, []
         predicted = [f"o{j}"]
         if j in self.lag:
-            lines += [
-                f"{name}{of}_{j} = mean[k, {j}, {of}, {i}]"
-                for of in (_OF_MEAN, _OF_SUM)
-                for i, name in enumerate(_WEIGHTS)
-            ]
             predicted, gains = self._summed_up(j, _OF_MEAN)
-        lines += [f"e = {_sum([*predicted, *_products(gains, 'd{}'.format)])} - y[k, {j}, l]"]
-        kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / r[k, {j}]))"
+        expected = _sum([*predicted, *_products(gains, "d{}".format)])
+        lines.append(f"e = {expected} - {self._innovation(j)}")
+        kept = f"e = e * (w{j} * math.sqrt(unit{j} / of_output{j}))"
         if gains:
             lines += [f"shared{a} = {_sum(_products(gains, _covariance_with(a)))}" for a in size]
             lines += [
-                f"variance = {_sum(_products(gains, 'shared{}'.format))} + r[k, {j}]",
+                f"variance = {_sum(_products(gains, 'shared{}'.format))} + of_output{j}",
                 f"gain = seen{j} * corrects / variance",
             ]
             lines += [f"d{a} -= shared{a} * (gain * e)" for a in size]
             lines += [f"P{a}_{b} -= shared{a} * (gain * shared{b})" for a, b in self.pairs]
-            kept = f"e = e * (w{j} * math.sqrt(unit[{j}] / variance))"
+            kept = f"e = e * (w{j} * math.sqrt(unit{j} / variance))"
             if self.variation.driven:
-                logarithm = f"seen{j} * math.log(variance / unit[{j}])"
+                logarithm = f"seen{j} * math.log(variance / unit{j})"
                 lines.append(f"{at(self._sums + self.n_measured + j)} += {logarithm}")
-        return [*lines, kept, f"{at(self._sums + j)} += e * e", f"record[k, {j}, l] = e"]
+        return [*lines, kept, f"{at(self._sums + j)} += e * e", f"{self._innovation(j)} = e"]
 
     def _estimate(self) -> list[str]:
         return []  # where they would stand are the sums of logarithms
@@ -235,12 +257,12 @@ class FilterKernel(BatchKernel):
         """x and P of the next sample."""
         n = len(self.reached)
         phi, gamma = self._jacobian_of("state", "begin"), self._jacobian_of("end")
-        fresh = {k: f"s[{k}]" for k in range(self.n_noises)}
+        fresh = {k: f"of_input{k}" for k in range(self.n_noises)}
         if self.coloured:  # what goes on of a noise acts at the interval's end as well
-            fresh = {k: f"(1.0 - colour[{k}] * colour[{k}]) * {s}" for k, s in fresh.items()}
+            fresh = {k: f"(1.0 - colour{k} * colour{k}) * {s}" for k, s in fresh.items()}
             for (a, k), response in gamma.items():
                 begun = f"{phi[a, n + k]} + " if (a, n + k) in phi else ""
-                phi[a, n + k] = f"({begun}colour[{k}] * {response})"
+                phi[a, n + k] = f"({begun}colour{k} * {response})"
         lines = [*self._loaded(), *self._tilted()]
         process = self._process()
         for a, i in enumerate(self.reached):
@@ -261,14 +283,14 @@ class FilterKernel(BatchKernel):
                     if (a, k) in gamma and (b, k) in gamma
                 ]
                 terms += [
-                    f"intensity[{k}] * ({level[a]} * {level[b]} + T{k}_{a} * T{k}_{b})"
+                    f"intensity{k} * ({level[a]} * {level[b]} + T{k}_{a} * T{k}_{b})"
                     for k, level in enumerate(process)
                     if a in level and b in level
                 ]
                 variances[a, b] = _sum(terms)
             for k in range(self.n_noises):
                 terms = [f"{gamma[a, k]} * {fresh[k]}"] if (a, k) in gamma else []
-                terms += [f"colour[{k}] * M{a}_{n + k}"] if self.coloured else []
+                terms += [f"colour{k} * M{a}_{n + k}"] if self.coloured else []
                 variances[a, n + k] = _sum(terms)
             for place in self.places[self.size :]:
                 terms = [f"{phi[a, c]} * P{c}_{place}" for c in range(self.size) if (a, c) in phi]
@@ -277,7 +299,7 @@ class FilterKernel(BatchKernel):
         variances |= {(a, b): f"P{a}_{b}" for a, b in self.pairs if a >= self.size}
         if self.coloured:
             variances |= self._going_on(fresh)
-            lines += [f"{at(self.noises + k)} *= colour[{k}]" for k in fresh]
+            lines += [f"{at(self.noises + k)} *= colour{k}" for k in fresh]
         return lines + self._stored(variances)
 
     def _going_on(self, fresh: Mapping[int, str]) -> dict[_Place, str]:
@@ -285,8 +307,8 @@ class FilterKernel(BatchKernel):
         n, going = len(self.reached), {}
         for a, b in self.pairs:
             if n <= a < self.size:
-                parts = [f"colour[{a - n}]", f"P{a}_{b}"]
-                parts += [f"colour[{b - n}]"] if b < self.size else []
+                parts = [f"colour{a - n}", f"P{a}_{b}"]
+                parts += [f"colour{b - n}"] if b < self.size else []
                 going[a, b] = _sum([" * ".join(parts), *([fresh[a - n]] if a == b else [])])
         return going
 

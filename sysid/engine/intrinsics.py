@@ -64,26 +64,48 @@ to_bits = _conversion("bitcast", ir.IntType(64), types.int64(types.float64))
 to_int32 = _conversion("fptosi", ir.IntType(32), types.int32(types.float64))
 
 
+def _row(context: Any, builder: Any, kind: Any, array: Any, place: Any) -> Any:
+    """Pointer to a row of lanes of a contiguous array, as one vector."""
+    data = context.make_array(kind)(context, builder, array).data
+    rows = ir.VectorType(ir.DoubleType(), LANES).as_pointer()
+    return builder.gep(builder.bitcast(data, rows), [place])
+
+
 @intrinsic
 def multiply_add(context: Any, c: Any, k: Any, a: Any, i: Any, b: Any, j: Any) -> Any:
     """c[k] += a[i] * b[j] for rows of lanes, (rows, LANES).
 
     Written as a loop the compiler would leave it scalar, not knowing the rows apart.
     """
-    rows = ir.VectorType(ir.DoubleType(), LANES)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointers = []
-        for place in (0, 2, 4):
-            array = context.make_array(signature.args[place])(context, builder, args[place])
-            data = builder.bitcast(array.data, rows.as_pointer())
-            pointers.append(builder.gep(data, [args[place + 1]]))
+        pointers = [
+            _row(context, builder, signature.args[place], *args[place : place + 2])
+            for place in (0, 2, 4)
+        ]
         total, left, right = (builder.load(pointer, align=8) for pointer in pointers)
         product = builder.fmul(left, right, flags=("contract",))
         builder.store(builder.fadd(total, product, flags=("contract",)), pointers[0], align=8)
         return context.get_dummy_value()
 
     return types.none(c, types.intp, a, types.intp, b, types.intp), generate
+
+
+@intrinsic
+def copy_row(context: Any, target: Any, i: Any, source: Any, j: Any) -> Any:
+    """Row i of lanes of a contiguous array of any shape set to row j of another; as above."""
+    if {target.layout, source.layout} != {"C"}:
+        return None
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        to, of = (
+            _row(context, builder, signature.args[place], *args[place : place + 2])
+            for place in (0, 2)
+        )
+        builder.store(builder.load(of, align=8), to, align=8)
+        return context.get_dummy_value()
+
+    return types.none(target, types.intp, source, types.intp), generate
 
 
 def shared(signature: str) -> Callable[[Callable[..., Any]], Any]:
