@@ -115,6 +115,9 @@ class RecordSimulator:
                 early = np.arange(len(windows))[:, None] + windows[..., 0] < -_BEFORE
                 self._weights = np.where(early, 0.0, self._weights)
             self._integrating = kernels(with_integrals(model, self.averaged))
+        # Measured outputs and weights that leave outputs, and integrals of them, as they are.
+        shape = len(outputs), outputs.shape[1] + len(self.averaged)
+        self._unmeasured = np.zeros(shape), np.ones(shape)
         self._weight = self._weights.max(axis=0)
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
@@ -188,10 +191,10 @@ class RecordSimulator:
         samples none are kept. Returns the residuals' sums of squares, (n, n_outputs), and error
         estimates in parts of what the accuracy allows, (n,).
         """
-        kept = np.empty((len(values), values.shape[1], LANES))
-        n_samples = self.record.n_samples
-        sse, estimates = self.block(parameters, starts, lanes, n_steps, n_samples, kept)
-        values[..., _neighbours(lanes)] = kept[..., : len(lanes)]
+        n_samples, keep = self.record.n_samples, len(values) > 0
+        sse, estimates, kept = self.block(parameters, starts, lanes, n_steps, n_samples, keep=keep)
+        if keep:
+            values[..., _neighbours(lanes)] = kept[..., : len(lanes)]
         return sse, self._excess(sse, estimates, np.full(len(lanes), n_steps * (n_samples - 1)))
 
     def innovations(
@@ -318,8 +321,7 @@ class RecordSimulator:
         work = work_area(kernel.work_rows * LANES)
         with explained_errors(model):
             tangents.simulate(
-                work, work.reshape(-1, LANES), kernel.tables, self._inputs,
-                np.zeros(kept.shape[:2]), np.ones(kept.shape[:2]),
+                work, work.reshape(-1, LANES), kernel.tables, self._inputs, *self._unmeasured,
                 np.ascontiguousarray(starts[padded].T), np.ascontiguousarray(parameters[padded].T),
                 self.record.dt, n_steps, np.empty((2 * kernel.n_outputs, LANES)), kept,
             )  # fmt: skip
@@ -334,21 +336,23 @@ class RecordSimulator:
         lanes: IntArray,
         n_steps: int,
         n_samples: int,
-        residuals: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
+        *,
+        keep: bool,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Sums of squared residuals and of error estimates of up to LANES rows, (n, n_outputs).
 
-        n_samples: how much of the record is simulated. residuals: (n_samples, n_outputs, LANES)
-        to fill, or of no size to keep none.
+        n_samples: how much of the record is simulated. With them the residuals if they are to be
+        kept, (n_samples, n_outputs, LANES).
         """
         if self.averaged:
-            return self._averaged_block(parameters, starts, lanes, n_steps, n_samples, residuals)
+            return self._averaged_block(parameters, starts, lanes, n_steps, n_samples)
+        residuals = np.empty((n_samples if keep else 0, self._measured.shape[1], LANES))
         run = tuple(part[:n_samples] for part in (self._inputs, self._measured, self._weights))
         start, dt = self._initial(starts, lanes), self.record.dt
         sums, estimates, _ = self._run(
             self.kernels, parameters, start, lanes, dt, n_steps, run, residuals
         )
-        return sums, estimates
+        return sums, estimates, residuals
 
     def _means(self, averaged: Sequence[int], corrects: bool) -> _Means:
         """Weights (n_samples, n_outputs, 2, 4) as of ``weights_of_sums`` for a filter.
@@ -448,9 +452,8 @@ class RecordSimulator:
         """
         q, more = self._measured.shape[1], len(self.averaged)
         kept = np.empty((n_samples, q + more, LANES))
-        signals = np.zeros((n_samples, q + more)), np.ones((n_samples, q + more))
         start, dt = self._integrating_start(starts, lanes), self.record.dt
-        run = self._inputs[:n_samples], *signals
+        run = tuple(part[:n_samples] for part in (self._inputs, *self._unmeasured))
         _, estimates, _ = self._run(
             self._integrating, parameters, start, lanes, dt, n_steps, run, kept
         )
@@ -469,8 +472,7 @@ class RecordSimulator:
         lanes: IntArray,
         n_steps: int,
         n_samples: int,
-        residuals: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As ``block``, of outputs over the record's windows."""
         outputs, integrals, estimates = self._integrated(
             parameters, starts, lanes, n_steps, n_samples
@@ -478,9 +480,7 @@ class RecordSimulator:
         for j, integral in zip(self.averaged, integrals, strict=True):
             outputs[:, j] = average(outputs[:, j], integral, self._windows[j, :n_samples])
         sums = compared(outputs, self._measured[:n_samples], self._weights[:n_samples])
-        if len(residuals):
-            residuals[:] = outputs
-        return sums.T[: len(lanes)], estimates
+        return sums.T[: len(lanes)], estimates, outputs
 
     def _run(
         self,
@@ -526,12 +526,11 @@ class RecordSimulator:
             for lanes in blocks_of(todo[steps[todo] == rung])
         ]
         estimates = np.zeros_like(population.sse)
-        nothing = np.empty((0, 0, 0))
 
         def run(task: tuple[IntArray, int]) -> None:
             lanes, rung = task
-            population.sse[lanes], estimates[lanes] = self.block(
-                population.parameters, population.starts, lanes, rung, n_samples, nothing
+            population.sse[lanes], estimates[lanes], _ = self.block(
+                population.parameters, population.starts, lanes, rung, n_samples, keep=False
             )
 
         self.workers.each(run, tasks)

@@ -346,7 +346,8 @@ class BatchSimulator:
         def run(task: tuple[int, RecordSimulator, FloatArray, slice, int]) -> None:
             r, simulator, from_starts, rows, steps = task
             part = simulator.tangents(lanes[rows], from_starts[rows], steps)
-            values[r][..., rows] = part if scales is None else part * simulator.weights[..., None]
+            scale = 1.0 if scales is None else simulator.weights[..., None]
+            np.multiply(part, scale, out=values[r][..., rows])
 
         self.workers.each(run, tasks)
         return [

@@ -136,7 +136,7 @@ def _weighed(values: FloatArray, residual: FloatArray, c: FloatArray) -> FloatAr
     everything = len(counted) == len(c)
     np.multiply(values if everything else values[:, counted], roots, out=rows[..., :k])
     rows[..., k] = residual[:, counted] * roots[:, 0]
-    if not np.isfinite(rows).all():
+    if not np.isfinite(rows.sum()):  # a number that is none, or a sum too large for one
         rows[..., :k][~np.isfinite(rows[..., :k])] = 0.0
     return rows.reshape(-1, k + 1)
 

@@ -5,6 +5,7 @@ code that analyses them: of a changed model or code nothing is taken from it.
 """
 
 import contextlib
+import functools
 import hashlib
 import pickle
 from importlib.metadata import version
@@ -38,6 +39,7 @@ def kept_identifiability(model: ProcessModel) -> Identifiability:
     return result
 
 
+@functools.lru_cache(maxsize=8)
 def _key(model: ProcessModel) -> str:
     signals = repr((model.states, model.inputs, model.outputs, model.parameters))
     key = hashlib.sha256(f"{fingerprint(model)}\n{version('python-flint')}\n{signals}".encode())

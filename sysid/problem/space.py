@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.data import Dataset
 from sysid.problem.model import Function, ModelError, Parameter, ProcessModel, Scale
 from sysid.problem.ranges import Range, Tie, ties, with_search_range
@@ -201,7 +201,7 @@ class SearchSpace:
             self.model, parameters=tuple(parameters), derivative=derivative, output=output
         )
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
@@ -249,12 +249,16 @@ class SearchSpace:
                     f"{parameter.maximum:g}]"
                 )
 
+    @cached_property
+    def _places(self) -> IntArray:
+        return np.array(self.index, dtype=np.int64)
+
     def full(self, chromosomes: FloatArray) -> FloatArray:
         """Complete parameter vectors of chromosomes, (..., n_parameters)."""
         chromosomes = np.asarray(chromosomes)
         vectors = np.empty((*chromosomes.shape[:-1], len(self.base)))
         vectors[:] = self.base
-        vectors[..., list(self.index)] = chromosomes[..., : len(self.index)]
+        vectors[..., self._places] = chromosomes[..., : len(self.index)]
         for tie in self.ties:
             vectors[..., tie.index] = tie.factor * vectors[..., tie.source]
         return vectors

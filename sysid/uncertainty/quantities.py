@@ -9,7 +9,7 @@ from sysid.arrays import FloatArray
 from sysid.fitting.descent import Restriction
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.estimate import Invariant
-from sysid.uncertainty.ties import named_values
+from sysid.uncertainty.ties import named_columns
 
 
 class Profiled(Protocol):
@@ -87,7 +87,10 @@ class Expression:
 
     def _places(self, chromosomes: FloatArray) -> FloatArray:
         """Places of chromosomes, (n,)."""
-        rows = (named_values(self._space, chromosome) for chromosome in chromosomes)
-        values = np.array([self._combination.value(row) for row in rows])
+        names, columns = self._combination.names, named_columns(self._space, chromosomes)
+        rows = zip(*(columns[name].tolist() for name in names), strict=True)
+        values = np.array(
+            [self._combination.value(dict(zip(names, row, strict=True))) for row in rows]
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.log(values) if self._log else values

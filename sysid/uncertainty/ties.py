@@ -188,6 +188,12 @@ def named_values(space: SearchSpace, chromosome: FloatArray) -> dict[str, float]
     return dict(zip(names, space.full(chromosome).tolist(), strict=True)) | free
 
 
+def named_columns(space: SearchSpace, chromosomes: FloatArray) -> dict[str, FloatArray]:
+    """The same of chromosomes (n, n_free), (n,) each."""
+    columns = [*space.full(chromosomes).T, *chromosomes.T]
+    return dict(zip((*space.model.parameter_names, *space.names), columns, strict=True))
+
+
 def free_gradient(
     combination: Invariant, space: SearchSpace, values: Mapping[str, float]
 ) -> FloatArray:
