@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,13 +40,23 @@ if TYPE_CHECKING:
 class Preparation:
     """What was done to a log before it was used: its steps, and the record before and after them.
 
-    start: where in the record before them the other begins [s].
+    used: what ``use`` leaves of the record, otherwise as it was logged. start: where in the record
+    before the steps the one after them begins [s].
     """
 
     steps: tuple[str, ...]
     before: Dataset
+    used: Dataset
     after: Dataset
     start: float
+
+
+@dataclass(frozen=True)
+class Cut:
+    """The whole of a log of which a part is used, and which, in words."""
+
+    whole: Dataset
+    step: str
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,7 +65,8 @@ class LoggedRecord(Shown):
 
     measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``; None
     where that leaves none out. preparation: what was done to it before, None for nothing. merged:
-    files with columns of it. of_a_rig: whether it is a run's log, with all that a run logs.
+    files with columns of it. cut: where not all of it is used. of_a_rig: whether it is a run's log,
+    with all that a run logs.
     """
 
     dataset: Dataset
@@ -63,6 +75,7 @@ class LoggedRecord(Shown):
     measured: Dataset | None = None
     preparation: Preparation | None = None
     merged: tuple[Path, ...] = ()
+    cut: Cut | None = None
     of_a_rig: bool = False
 
     @property
@@ -76,7 +89,8 @@ class LoggedRecord(Shown):
         """Its record in which faults of samples show: a low-pass makes overshoots of levels."""
         if self.measured is not None:
             return self.measured
-        return self.dataset if self.preparation is None else self.preparation.before
+        made = self.preparation
+        return self.dataset if made is None or made.after is made.used else made.used
 
 
 Split = tuple[list[LoggedRecord], list[LoggedRecord]]  # for training, for validation
@@ -204,7 +218,10 @@ def from_recording(
     outputs = np.array([recording.noise(n) for n in model.output_names]).reshape(-1, 2).T
     calibrated = {"output_noise": outputs[0], "output_zero": outputs[1]}
     dataset = replace(dataset, input_noise=noise, input_zero=zero, **calibrated)
-    log = LoggedRecord(dataset, recording.path, recording.warning, of_a_rig=True)
+    time = recording.columns["t"]
+    whole = partial(_from_log, recording, model, recording.name, EVERYTHING, speeds)
+    cut = _cut(selection, recording.path, time, whole)
+    log = LoggedRecord(dataset, recording.path, recording.warning, cut=cut, of_a_rig=True)
     return _prepared(log, model, selection)
 
 
@@ -234,7 +251,8 @@ def from_frame(
         refuse_rows(path, wrong, "it is not finite", 0, column, cure)
     columns["tick"], dt = time_base(path, columns["t"], first_line=0)
     log = Recording(path, columns, dt)
-    record = LoggedRecord(_from_log(log, model, name, selection), path, None)
+    cut = _cut(selection, path, columns["t"], partial(_from_log, log, model, name, EVERYTHING))
+    record = LoggedRecord(_from_log(log, model, name, selection), path, None, cut=cut)
     return _prepared(record, model, selection)
 
 
@@ -242,20 +260,36 @@ def _prepared(log: LoggedRecord, model: ProcessModel, selection: Selection) -> L
     """A log as ``delay``, ``detrend``, ``decimate``, ``run_in`` and ``robust`` want it."""
     dataset = selection.with_averages(selection.with_noise(log.dataset, model), model)
     log = replace(log, dataset=dataset)
+    steps, used, start = _merging(log) + _cutting(log), log.dataset, 0.0
     if selection.preparation.needed:
-        made, before = selection.prepared(log.dataset, log.path, model), log.dataset
-        steps = (*_merging(log), *made.steps)
-        preparation = Preparation(steps, before, made.dataset, made.start)
-        dataset = replace(made.dataset, begin=before.begin + made.start)
-        log = replace(log, dataset=dataset, preparation=preparation)
-    elif log.merged:
-        log = replace(log, preparation=Preparation(_merging(log), log.dataset, log.dataset, 0.0))
+        made = selection.prepared(used, log.path, model)
+        steps, start = steps + made.steps, made.start
+        log = replace(log, dataset=replace(made.dataset, begin=used.begin + start))
+    if steps:
+        before = used if log.cut is None else log.cut.whole
+        start += used.begin - before.begin
+        log = replace(log, preparation=Preparation(steps, before, used, log.dataset, start))
     log = replace(log, dataset=_without_run_in(log.dataset, log.path, model, selection))
     return _mended(log, model, selection)
 
 
 def _merging(log: LoggedRecord) -> tuple[str, ...]:
     return (f"merged with {', '.join(map(str, log.merged))}",) if log.merged else ()
+
+
+def _cutting(log: LoggedRecord) -> tuple[str, ...]:
+    return () if log.cut is None else (log.cut.step,)
+
+
+def _cut(
+    selection: Selection, path: Path, time: FloatArray, whole: Callable[[], Dataset]
+) -> Cut | None:
+    """Where ``use`` leaves rows of a log out; time: (n,) [s], of all; whole: gives their record."""
+    first, last, _ = selection.rows(path, time).indices(len(time))
+    if (first, last) == (0, len(time)):
+        return None
+    part = f"{time[first]:g} s .. {time[last - 1]:g} s"
+    return Cut(whole(), f"cut to {part}, rows {first + 1} .. {last} of {len(time)}")
 
 
 def _mended(log: LoggedRecord, model: ProcessModel, selection: Selection) -> LoggedRecord:
@@ -291,7 +325,16 @@ def _foreign(
         begin=float(time[0]),
     )
     warning = end_of_run(path, read_record(path), table.torn)
-    log = LoggedRecord(dataset, path, warning, merged=tuple(others))
+
+    def whole() -> Dataset:
+        if _is_sparse(table.tick):  # what is left out may have any gaps
+            return dataset
+        parts = table.inputs, table.outputs, table.tick
+        record = _dataset(path, model, *parts, table.dt, path.stem)
+        return replace(record, begin=float(table.time[0]))
+
+    cut = _cut(selection, path, table.time, whole)
+    log = LoggedRecord(dataset, path, warning, merged=tuple(others), cut=cut)
     return _prepared(log, model, selection)
 
 

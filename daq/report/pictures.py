@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,11 +29,12 @@ from daq.logs.recording import load
 from daq.report.page import Picture
 from sysid import Dataset, ModelError, Output, equilibrium, evaluate, linearize
 from sysid.arrays import FloatArray
-from sysid.judging.residual_tests import residual_test
+from sysid.judging.residual_tests import LAGS, residual_test
 from sysid.problem.metrics import mean_known
 from sysid.problem.model import ProcessModel
 from sysid.problem.plots import Evidence, Plot
 from sysid.response.frequency import FrequencyResponse, frequency_response, sampled_response
+from sysid.response.linearization import LinearModel
 from sysid.time_limit import AT_LENGTH, time_limit
 from sysid.uncertainty.draws import plausible_parameters
 
@@ -46,6 +48,8 @@ _CLOSER = 60  # samples of a prepared log that are shown closer, as delays are o
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
 _FINE = 400  # frequencies over the band at which linear models are drawn
 _COHERENT = 0.5  # coherence above which an input is seen in an output
+_DECAYED = 3.0  # time constants, after which a twentieth is left
+_MOST_LAGS = 1000  # of residuals' correlations that are drawn
 _FEWEST_COHERENT = 4  # frequencies at which it must be, for a Bode plot
 
 Given = TypeVar("Given")
@@ -81,6 +85,15 @@ class Subject:
     def records(self) -> list[Dataset]:
         """The data of all logs."""
         return [log.dataset for log, _ in (*self.training, *self.validation)]
+
+    @cached_property
+    def linear(self) -> dict[str, LinearModel | None]:
+        """The identified model linearised, by operating point; None without an equilibrium."""
+        model, records = self.model, self.records
+        u = np.concatenate([record.inputs for record in records]).mean(axis=0)
+        points = _by_model(model, model.operating_points, records) if model.operating_points else {}
+        points = points or {"linear, mean inputs": {}}
+        return {name: _linearised(self, u, held) for name, held in points.items()}
 
     @property
     def foreign(self) -> bool:
@@ -192,8 +205,10 @@ def _residuals(subject: Subject) -> Iterator[Picture]:
     data = log.dataset
     if not np.isfinite(run).all():
         return
-    test = residual_test(data.outputs - run, data.inputs, data.input_noise)
+    lags = min(max(LAGS, math.ceil(_memory(subject) / data.dt)), _MOST_LAGS)
+    test = residual_test(data.outputs - run, data.inputs, data.input_noise, lags)
     which = f"{data.name}, the first of {len(logs)}" if len(logs) > 1 else data.name
+    shares = f" The table's shares are of the first {LAGS} lags." * (len(test.lags) > LAGS)
     lines = {}
     for j, output in enumerate(subject.model.outputs):
         lines[output.name] = {"with its past": test.auto[:, j] / float(test.auto_band[j])}
@@ -207,7 +222,7 @@ def _residuals(subject: Subject) -> Iterator[Picture]:
         "residuals", "residuals",
         f"Correlation of the residuals ({which}) with their own past and with past inputs, in "
         "parts of the 95 % band (grey), that of inputs as wide as the parameters' uncertainty "
-        "makes it: a model that explains all but white noise stays inside.",
+        f"makes it: a model that explains all but white noise stays inside.{shares}",
         residual_correlations(np.asarray(test.lags * data.dt), lines),
     )  # fmt: skip
 
@@ -373,13 +388,9 @@ def _linear_responses(
     subject: Subject, frequency: FloatArray
 ) -> tuple[dict[str, ComplexArray], str]:
     """Of the identified model linearised, by operating point; what has none, in a sentence."""
-    model, records = subject.model, subject.records
-    curves = {}
-    u = np.concatenate([record.inputs for record in records]).mean(axis=0)
-    points = _by_model(model, model.operating_points, records) if model.operating_points else {}
-    lacking = []
-    for name, held in (points or {"linear, mean inputs": {}}).items():
-        response = _linear_response(subject, u, held, frequency, records[0].dt)
+    curves, lacking = {}, []
+    for name, linear in subject.linear.items():
+        response = None if linear is None else _linear_response(subject, linear, frequency)
         if response is not None:
             curves[name] = response
         else:
@@ -388,18 +399,34 @@ def _linear_responses(
     return curves, f" Not drawn is {'; '.join(lacking)}: {why}." if lacking else ""
 
 
-def _linear_response(
-    subject: Subject, u: FloatArray, held: Mapping[str, float], frequency: FloatArray, dt: float
-) -> ComplexArray | None:
-    """Of the model linearised at constant inputs u; None without an equilibrium there."""
+def _linearised(subject: Subject, u: FloatArray, held: Mapping[str, float]) -> LinearModel | None:
+    """At constant inputs u; None where there is no equilibrium or no slope."""
     model, p = subject.model, subject.vector
     try:
         with time_limit(AT_LENGTH):
             linear = linearize(model, equilibrium(model, u, p, hold=dict(held)), u, p)
-        response = sampled_response(linear, frequency, dt, [i.hold for i in model.inputs])
     except (ModelError, ArithmeticError, TimeoutError, ValueError, np.linalg.LinAlgError):
-        return None  # singular there; the other curves say what there is
+        return None
+    return linear if all(np.isfinite(matrix).all() for matrix in linear) else None
+
+
+def _linear_response(
+    subject: Subject, linear: LinearModel, frequency: FloatArray
+) -> ComplexArray | None:
+    """From samples to samples; None where it is singular."""
+    holds = [signal.hold for signal in subject.model.inputs]
+    try:
+        response = sampled_response(linear, frequency, subject.records[0].dt, holds)
+    except (ModelError, ArithmeticError, ValueError, np.linalg.LinAlgError):
+        return None  # the other curves say what there is
     return response if np.isfinite(response).all() else None
+
+
+def _memory(subject: Subject) -> float:
+    """Until the slowest mode of the linearised model has decayed [s]; 0 if none is known to."""
+    matrices = [linear.A for linear in subject.linear.values() if linear is not None]
+    rates = [rate for A in matrices for rate in (-np.linalg.eigvals(A).real).tolist() if rate > 0.0]
+    return _DECAYED / min(rates) if rates else 0.0
 
 
 def _plots_of_model(subject: Subject) -> Iterator[Picture]:

@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.uncertainty.estimate import Z95
 
+LAGS = 50  # at which correlations are tested
 _LEAST_VARIANCE = 0.05  # of a correlation, in parts of 1/n: estimated ones can turn out negative
 
 
@@ -52,7 +53,7 @@ def residual_test(
     residual: FloatArray,
     inputs: FloatArray,
     input_noise: FloatArray | None = None,
-    n_lags: int = 50,
+    n_lags: int = LAGS,
     systematic: FloatArray | None = None,
 ) -> ResidualTest:
     """Correlations of measured minus simulated, (n, n_outputs), NaN where a sample was lost.

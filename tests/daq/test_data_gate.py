@@ -66,9 +66,17 @@ def settled(folder, *settings, name="day1.csv", **changes):
 )
 def test_a_part_of_a_log_is_used(folder, use, first, last):
     rows = table().iloc[first : last + 1]
-    record = loaded(folder, use=use).dataset
-    assert record.inputs[:, 0].tolist() == rows["u"].tolist()
-    assert record.outputs[:, 0].tolist() == rows["y"].tolist()
+    log = loaded(folder, use=use)
+    assert log.dataset.inputs[:, 0].tolist() == rows["u"].tolist()
+    assert log.dataset.outputs[:, 0].tolist() == rows["y"].tolist()
+    assert log.unmended is log.dataset, "what is left out has no faults"
+
+
+def test_a_cut_is_recorded_and_shown(folder):
+    (made, whole) = (loaded(folder, use=use).preparation for use in ("0.5 s .. 1 s", ".. 100 s"))
+    assert made.steps == ("cut to 0.5 s .. 1 s, rows 51 .. 101 of 200",)
+    assert (made.before.n_samples, made.after.n_samples, made.start) == (200, 51, 0.5)
+    assert whole is None
 
 
 def test_times_are_those_of_the_file(folder):

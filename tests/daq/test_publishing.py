@@ -158,6 +158,7 @@ def test_the_page_needs_nothing_else(page, work):
     assert all(address.startswith(("#", "data:")) for address in page.addresses)
     assert not {"script", "link", "iframe", "img", "object"} & set(page.tags)
     assert "@import" not in text
+    assert "first 50 lags" not in text, "three time constants are 30 samples, and all are tested"
     assert page.open == []
     assert len(set(page.ids)) == len(page.ids)
     # What clips and glyphs refer to is on the page.
@@ -176,11 +177,13 @@ from sysid import Input, Output, Parameter, ProcessModel, State
 
 model = ProcessModel(
     name="two lags",
-    states=(State("y", "m"), State("z", "m")),
+    states=(State("y", "m"), State("z", "m"), State("slow", "V")),
     inputs=(Input("u", "V"),),
     outputs=(Output("y", "m"), Output("z", "m")),
     parameters=(Parameter("tau", "s", 0.3, 0.05, 1.0, "log"),),
-    derivative=lambda x, u, p: ((2.0 * u[0] - x[0]) / p[0], (2.0 * u[0] - x[1]) / p[0]),
+    derivative=lambda x, u, p: (
+        (2.0 * u[0] - x[0]) / p[0], (2.0 * u[0] - x[1]) / p[0], u[0] - x[2]
+    ),
 )
 """
 
@@ -203,7 +206,10 @@ def test_gaps_of_an_output_do_not_take_away_the_frequency_response_of_another(tm
     assert done.returncode == 0, done.stderr
     drawn = {path.stem for path in (tmp_path / "found/figures").glob("bode-*.svg")}
     assert drawn == {"bode-y"}
-    assert "No frequency response of z is drawn" in (tmp_path / "found/report.html").read_text()
+    page = (tmp_path / "found/report.html").read_text()
+    assert "No frequency response of z is drawn" in page
+    # The slow state remembers for three seconds, of which residuals are drawn.
+    assert "shares are of the first 50 lags" in page
 
 
 def test_text_from_users_is_text(page):
