@@ -30,6 +30,8 @@ _TEX_UNITS = {"*": r"\,", "ohm": r"\ensuremath{\Omega}"}
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # Not before a power, which would raise the prefix too: 1 mm^2 is not 1e-3 m^2.
+# What stands behind a number in a sentence and has a sign of multiplication or a power in it.
+_UNIT_BEHIND = re.compile(r"(?<=\d )[^\W\d]\w*(?:[*/^]-?\(?\w+\)?)+")
 _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
 
 
@@ -73,6 +75,16 @@ def unit_text(unit: str) -> str:
         return ""
     text = re.sub(r"\bohm\b", "Ω", unit).replace("*", "·")
     return re.sub(r"\^(-?\d+)", lambda power: raised(power[1]), text)
+
+
+def prose(text: str) -> str:
+    """A printed sentence as a page has it: ``→`` for ``->``, units in their symbols.
+
+    >>> prose("B_m 579 -> 400 µN*m*s/rad, J 8.2e-5 kg*m^2.")
+    'B_m 579 → 400 µN·m·s/rad, J 8.2e-5 kg·m².'
+    """
+    units = _UNIT_BEHIND.sub(lambda match: unit_text(match[0]), text)
+    return units.replace(" -> ", " → ")
 
 
 def unit_tex(unit: str) -> str:

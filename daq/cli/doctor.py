@@ -75,7 +75,7 @@ def doctor(
         terminal.print_table("This computer", head, cells, text=head)
         for check in checks:
             if check.cure:
-                print(f"{check.subject}: {check.cure}")
+                terminal.print_text(f"{check.subject}: {check.cure}")
     if bad:
         problem = f"not fit for a rig in real time: {', '.join(bad)}"
         raise RunError(problem, cure="the cures stand above")

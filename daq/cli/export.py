@@ -95,7 +95,8 @@ def export_fmu(
     if json:
         terminal.print_json({"file": path, "model": unit.identifier, "binaries": binaries})
         return
-    print(f"Written: {path}{f' (with a binary for {binaries[0]})' if binaries else ''}")
+    binary = f" (with a binary for {binaries[0]})" if binaries else ""
+    terminal.print_text(f"Written: {path}{binary}")
 
 
 def export_c(

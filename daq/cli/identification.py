@@ -97,7 +97,7 @@ def _show(result: Identification) -> None:
         _show_open_questions(rows)
     _show_profiles(result.profiles)
     _show_errors(rows)
-    _show_residuals(rows)
+    _show_residuals(rows, any(log.log.dataset.input_noise.any() for log in result.training))
     _show_notes(result)
     print(f"Parameters: {result.parameters_file}")
 
@@ -250,8 +250,11 @@ def _show_errors(rows: Rows) -> None:
             print_errors({**errors, **mean}, f"{part} log")
 
 
-def _show_residuals(rows: Rows) -> None:
-    """Residual tests on the validation data, or else on the training data."""
+def _show_residuals(rows: Rows, noisy: bool) -> None:
+    """Residual tests on the validation data, or else on the training data.
+
+    noisy: whether an input is known to be measured with noise.
+    """
     table = rows.residuals
     head = ["residual of", "with itself", *(f"with {name}" for name in table.inputs)]
     cells = [
@@ -261,10 +264,14 @@ def _show_residuals(rows: Rows) -> None:
     terminal.print_table(title, head, cells)
     coloured = [name for name, (past, *_) in table.shares.items() if past < _COLOURED]
     if coloured:
+        cause = (
+            "as noise of a measured input makes them"
+            if noisy
+            else ("as what the model lacks makes them, or a sensor's own noise")
+        )
         terminal.print_text(
-            f"Few with itself ({', '.join(coloured)}): coloured residuals, as noise of a measured "
-            "input makes them. The intervals allow for it; few with an input would speak against "
-            "the model."
+            f"Few with itself ({', '.join(coloured)}): coloured residuals, {cause}. The intervals "
+            "allow for it; few with an input would speak against the model."
         )
 
 
@@ -429,14 +436,18 @@ def _validation_row(row: Row) -> list[str]:
         f"{terminal.number(float(rmse), 3)} ({fit:.1f})"
         for rmse, fit in zip(row.rmse, row.fit, strict=True)
     ]
+    from sysid.judging.comparison import times
+
     ratio = row.ratio
     if ratio is None:
         return [row.name, *cells, "", "", row.verdict]
-    interval = f"{ratio.low:.3g} .. {ratio.high:.3g}"
-    return [row.name, *cells, f"x {ratio.value:.3g}", interval, row.verdict]
+    value, low, high = map(times, (ratio.value, ratio.low, ratio.high))
+    return [row.name, *cells, f"x {value}", f"{low} .. {high}", row.verdict]
 
 
 def _training_row(row: Row) -> list[str]:
+    from sysid.judging.comparison import above
+
     error = terminal.number(row.training_error, 3)
     counts = [str(row.n_free), str(row.n_effective)]
-    return [row.name, *counts, error, f"{row.daic:.1f}", f"{row.dbic:.1f}"]
+    return [row.name, *counts, error, above(row.daic), above(row.dbic)]

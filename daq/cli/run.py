@@ -144,7 +144,7 @@ def _show(result: SessionResult) -> None:
         print(f"{label}: {run.folder / 'log.csv'} ({samples})")
         line = punctuality.summary_line(run)
         if line is not None:
-            print(line)
+            terminal.print_text(line)
         for note in punctuality.notes(run):
             terminal.report("note", note)
     for doubt in result.doubts:

@@ -113,11 +113,20 @@ def print_next(*commands: str, purpose: str = "") -> None:
 
 
 def print_steps(steps: Sequence[tuple[str, str]]) -> None:
-    """What to do in this order, and what each is for, a numbered line each."""
-    if _volume.get() >= Volume.NORMAL:
-        width = max(len(action) for action, _ in steps)
-        for place, (action, purpose) in enumerate(steps, start=1):
-            print(f"{place}. {action:<{width}}  {purpose}")
+    """What to do in this order, and what each is for, a numbered line each.
+
+    On a terminal too narrow for that, what each is for stands below it.
+    """
+    if _volume.get() < Volume.NORMAL:
+        return
+    width = max(len(action) for action, _ in steps)
+    lines = [f"{k}. {action:<{width}}  {purpose}" for k, (action, purpose) in enumerate(steps, 1)]
+    if not sys.stdout.isatty() or max(map(len, lines)) <= shutil.get_terminal_size().columns:
+        print(*lines, sep="\n")
+        return
+    for k, (action, purpose) in enumerate(steps, 1):
+        print(f"{k}. {action}")
+        print_text(f"   {purpose}")
 
 
 def print_json(document: Any) -> None:
@@ -202,7 +211,7 @@ def print_table(
     )  # fmt: skip
     for name, width, is_text in zip(head, widths, words, strict=True):
         table.add_column(
-            _folded(name, width, _JOINT_OF_HEADS), width=width, overflow="fold",
+            _folded_head(name, width), width=width, overflow="fold",
             justify="left" if is_text else "right",
         )  # fmt: skip
     for row in rows:
@@ -252,14 +261,21 @@ def _lines(cells: Iterable[str]) -> list[str]:
 def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int) -> list[int]:
     """Widths of columns, heads first, within the room: numbers and words stay whole if they can.
 
-    Else names are wrapped at their joints, and if that is not enough cells of numbers between them.
+    Else names are wrapped at their joints, those of heads first, and if that is not enough cells of
+    numbers between them.
     """
-    for text, numbers in ((_SPACE, None), (_JOINT, None), (_JOINT, _SPACE)):
+    joints = [
+        (_SPACE, None, _SPACE),
+        (_SPACE, None, _JOINT_OF_HEADS),
+        (_JOINT, None, _JOINT_OF_HEADS),
+        (_JOINT, _SPACE, _JOINT_OF_HEADS),
+    ]
+    for text, numbers, heads in joints:
         widths = []
         for cells, is_text in zip(columns, words, strict=True):
             joint = text if is_text else numbers
             parts = [part for cell in cells[1:] for part in _parts(cell, joint)]
-            widths.append(max(map(len, [*parts, *_parts(cells[0], _JOINT_OF_HEADS)]), default=0))
+            widths.append(max(map(len, [*parts, *_parts(cells[0], heads)]), default=0))
         if sum(widths) <= room:
             break
     # What is left goes to text first, which is wrapped in every row.
@@ -286,6 +302,12 @@ def _folded(text: str, width: int, joint: str) -> str:
         else:
             lines.append(part)
     return "\n".join(lines)
+
+
+def _folded_head(name: str, width: int) -> str:
+    """A head on lines no wider than that, broken at joints only where its words are too long."""
+    is_narrow = max(map(len, _parts(name, _SPACE)), default=0) > width
+    return _folded(name, width, _JOINT_OF_HEADS if is_narrow else _SPACE)
 
 
 def _cell(text: str, width: int) -> str:

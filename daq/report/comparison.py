@@ -15,6 +15,7 @@ from daq.identification.comparison import ComparisonResult
 from daq.lookup.models import trust_option
 from daq.report.page import Picture, rendered
 from daq.report.publication import FIGURES, command_of, draw, fingerprints
+from sysid.judging.comparison import AS_GOOD
 
 _PAGE = "comparison.html"
 
@@ -39,6 +40,7 @@ def publish_comparison(result: ComparisonResult) -> str:
         "written": f"{now:%Y-%m-%d %H:%M} UTC",
         "outputs": result.outputs,
         "units": {output.name: output.unit for output in group.problem.model.outputs},
+        "as_good": AS_GOOD,
         "preferred_file": preferred.get("parameters_file"),
         "trust_option": trust_option(preferred["name"]),
         "reproduction": {

@@ -15,6 +15,7 @@ from daq import notation
 from daq.identification.rows import QuantityRow, Rows
 from daq.report.explanation import view
 from sysid import ProcessModel
+from sysid.judging.comparison import above, times
 
 # In the order of the page.
 TOPICS = (
@@ -78,6 +79,9 @@ def rendered(
         "command": lambda text: Markup(_OPTION.sub(r"<b>\1</b>", str(escape(text)))),
         "jointed": lambda name: Markup(_JOINT.sub("<wbr>", str(escape(name)))),
         "measured": _measured,
+        "prose": notation.prose,
+        "times": lambda ratio: _marked(ratio, times),
+        "above": lambda criterion: _marked(criterion, above),
         "percent": lambda value: _marked(value, notation.percent),
         "marked": lambda text: Markup(_CODE.sub(r"<code>\1</code>", str(escape(text)))),
     }

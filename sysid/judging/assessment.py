@@ -17,6 +17,7 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.findings import MOVED, Finding, description
+from sysid.judging.phrases import change
 from sysid.judging.residual_patterns import errors_alone, errors_by_speed, shared_errors
 from sysid.judging.residual_tests import ResidualTest, residual_test
 from sysid.judging.starts import Starts
@@ -550,7 +551,7 @@ def _lacking(alternative: Alternative) -> str:
         for name, (old, new) in alternative.fits.items()
         if new - old >= 1.0
     ]
-    moved = [f"{name} {_change(*move)}" for name, move in list(alternative.values.items())[:3]]
+    moved = [f"{name} {change(*move)}" for name, move in list(alternative.values.items())[:3]]
     effect = ", ".join([*fits, *moved]) or "it explains the training data better"
     return f"The model lacks {alternative.name}; fitted with it: {effect}."
 
@@ -559,7 +560,7 @@ def _moving(finding: Finding) -> str:
     """Reason: something missing that moves parameters."""
     moved = [
         f"{m.quantity.name} "
-        + _change(m.quantity.value, m.quantity.value + m.change, m.quantity.unit)
+        + change(m.quantity.value, m.quantity.value + m.change, m.quantity.unit)
         for m in finding.moves[:3]
         if abs(m.deviations) > 1.0
     ]
@@ -598,18 +599,6 @@ def _in_vain(finding: Finding, fitted: Alternative) -> str:
 
 def _chance(finding: Finding) -> str:
     return "p < 1e-9" if finding.p_value < 1e-9 else f"p = {finding.p_value:.0e}"
-
-
-def _change(old: float, new: float, unit: str) -> str:
-    """Two values, to as many digits as tell them apart.
-
-    >>> _change(0.0030012, 0.0030104, "H"), _change(1.2, 80.0, "1")
-    ('0.003001 -> 0.00301 H', '1.2 -> 80')
-    """
-    size, difference = max(abs(old), abs(new)), abs(new - old)
-    apart = math.ceil(math.log10(size / difference)) + 1 if difference else 3
-    digits = min(max(apart, 3), 6)
-    return f"{old:.{digits}g} -> {new:.{digits}g} {'' if unit == '1' else unit}".strip()
 
 
 def _untested(

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from sysid.gassi import GASSI
     from sysid.linear import ARMAX, ARX, OE
 
-# Squared errors larger by no more than this share make no difference in practice.
-_MARGIN = 0.01
+# Squared errors of at most so many times the best one's make no difference in practice.
+AS_GOOD = 1.01
 # A difference of BIC up to this is not worth more than a bare mention (Kass & Raftery, "Bayes
 # factors", J. American Statistical Association 90, 1995).
 _BIC_MARGIN = 2.0
@@ -356,7 +356,7 @@ def _standing(best: bool, score: float, ratio: Ratio | None, dbic: float) -> Sta
         return "failed"
     if best:
         return "best"
-    good = ratio.low <= 1.0 + _MARGIN if ratio is not None else dbic <= _BIC_MARGIN
+    good = ratio.low <= AS_GOOD if ratio is not None else dbic <= _BIC_MARGIN
     return "as good" if good else "worse"
 
 
@@ -365,8 +365,8 @@ def _against(row: Row, best: str) -> str:
     if row.verdict == "failed":
         return f"{row.name} failed: its free run grows out of bounds."
     if row.ratio is None:
-        return f"{row.name} is {row.dbic:.3g} above it: {row.verdict}."
-    value, low, high = (_times(x) for x in (row.ratio.value, row.ratio.low, row.ratio.high))
+        return f"{row.name} is {above(row.dbic)} above it: {row.verdict}."
+    value, low, high = (times(x) for x in (row.ratio.value, row.ratio.low, row.ratio.high))
     size = f"{row.name} has squared errors {value} times those of {best} (95 %: {low} to {high})"
     if row.verdict == "worse":
         p = "p < 0.001" if row.ratio.p_value < 1e-3 else f"p = {row.ratio.p_value:.2g}"
@@ -374,5 +374,11 @@ def _against(row: Row, best: str) -> str:
     return f"{size}: as good, as far as these data tell."
 
 
-def _times(ratio: float) -> str:
+def times(ratio: float) -> str:
+    """A ratio of squared errors, as finely as it tells structures apart."""
     return f"{ratio:.3g}" if abs(ratio) >= 10.0 else f"{ratio:.3f}"
+
+
+def above(criterion: float) -> str:
+    """By how much a criterion is above the lowest, as finely as it matters."""
+    return f"{criterion:.1f}" if abs(criterion) < 99.95 else f"{criterion:.0f}"

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from sysid.judging.phrases import sized
 from sysid.judging.suspects import Kind
 from sysid.problem.terms import AddedTerm
 from sysid.uncertainty import Estimate
@@ -138,7 +139,7 @@ def description(finding: Finding) -> str:
             name=finding.name,
             late=late,
             amplitude=size,
-            time=_time(size),
+            time=sized(size, "s"),
             times=1.0 + size,
             unit=unit,
             instead=instead,
@@ -146,18 +147,6 @@ def description(finding: Finding) -> str:
         .replace("  ", " ")
         .strip()
     )
-
-
-def _time(seconds: float) -> str:
-    """A time in the multiple of its unit that reads best.
-
-    >>> _time(5.01e-5), _time(0.002), _time(0.25)
-    ('50.1 µs', '2 ms', '0.25 s')
-    """
-    size = abs(seconds)
-    if size >= 0.1 or not size:
-        return f"{seconds:.3g} s"
-    return f"{1e3 * seconds:.3g} ms" if size >= 1e-3 else f"{1e6 * seconds:.3g} µs"
 
 
 def _term_text(term: AddedTerm) -> str:

@@ -213,6 +213,22 @@ def test_a_terminal_shows_the_last_of_many_runs_and_a_pipe_all(tmp_path):
     assert on_terminal(["runs", "--last", "250"], tmp_path, columns=80).count("-run") == 250
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
+def test_free_keys_that_have_no_room_are_named_and_runs_keep_their_names(tmp_path):
+    names = [f"20260101T12000{k}Z-prbs-{'after_' * k}repair" for k in (0, 1)]
+    keys = ("temperature", "sample_of_the_fluid", "supply_of_the_motor")
+    for k, name in enumerate(names):
+        folder = tmp_path / "runs" / name
+        folder.mkdir(parents=True)
+        (folder / "log.csv").touch()
+        notes = [word for key in keys for word in ("--note", f"{key}={k} as measured")]
+        rig("runs", name, *notes, cwd=tmp_path)
+    shown = on_terminal(["runs"], tmp_path, columns=80)
+    assert max(map(len, shown.splitlines())) <= 80
+    assert all(name in shown for name in names) and "1 as measured" in shown
+    assert "no room for sample_of_the_fluid: --details" in " ".join(shown.split())
+
+
 def test_in_a_pipe_a_run_is_one_line_whatever_is_noted_of_it(tmp_path):
     folder = tmp_path / "runs" / "noted"
     folder.mkdir(parents=True)

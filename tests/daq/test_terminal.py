@@ -116,13 +116,14 @@ def test_tab_completes_the_installed_command(tmp_path):
 
 
 TABLE = """
-from daq.cli.terminal import print_table, print_text
+from daq.cli.terminal import print_steps, print_table, print_text
 print_table("Title [rad/s]", ["name", "omega [rad/s]", "meaning"],
             [["K_m", "0.135 .. 0.151", "[low, high] of a :smile:" * 9]], text=["meaning"])
 print_table("Wide", ["output", "RMSE, training", "with applied_voltage_motor", "fit [%]"],
             [["current_motor", "0.00969", "100 %", "98.7"]])
 print_table("Named", ["output", "log", "RMSE", "in its unit"],
             [["omega", "20260101T120000Z-prbs-validation", "0.0256", "0.377 rad/s"]], text=["log"])
+print_steps([("rig check RIG.yaml", "what the sensors read"), ("go", "on " * 21 + "and on")])
 print_text("  " + "Trust: good. " * 9)
 """
 
@@ -139,7 +140,7 @@ def test_a_table_in_a_pipe_has_a_line_for_each_row_and_takes_nothing_for_markup(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal is needed")
-@pytest.mark.parametrize("columns", [30, 50])
+@pytest.mark.parametrize("columns", [30, 50, 60])
 def test_a_narrow_terminal_cuts_nothing(columns):
     import pty
 
@@ -157,12 +158,17 @@ def test_a_narrow_terminal_cuts_nothing(columns):
     assert "0.135 .. 0.151" in shown and "omega [rad/s]" in shown
     assert shown.count(":smile:") >= 9
     # Heads are folded, where they have parts, and names only where that does not make room enough.
-    assert re.search("current_motor +0.00969 " if columns == 50 else "current_ +0.00969 ", shown)
+    assert re.search("current_ +0.00969 " if columns == 30 else "current_motor +0.00969 ", shown)
     assert "with applied_voltage_motor" not in shown and "voltage_" in shown
+    assert ("applied_voltage_motor" in shown) == (columns == 60)
+    steps = shown[shown.index("1. rig check") :].splitlines()
+    assert steps[0] == "1. rig check RIG.yaml" and steps[1] == "   what the sensors read"
+    assert max(map(len, steps)) <= columns
     sentences = [line for line in shown.splitlines() if "good." in line]
-    assert len(sentences) > 2 and all(line.startswith("  ") for line in sentences)
+    assert len(sentences) > 1 and all(line.startswith("  ") for line in sentences)
     assert max(map(len, sentences)) <= columns
-    assert re.search("20260101T120000Z- +0.0256 ", shown), "wrapped where a name has a joint"
+    if columns < 60:
+        assert re.search("20260101T120000Z- +0.0256 ", shown), "wrapped where a name has a joint"
     wide = shown[shown.index("Wide") :].splitlines()
     assert columns == 30 or max(map(len, wide)) <= columns
 
