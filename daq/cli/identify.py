@@ -19,7 +19,8 @@ def identify(
     config: options.ConfigFile = None,
     validate: options.Validation = None,
     out: Annotated[
-        Path | None, Option(metavar="DIR", help="Where results go; default beside the log.")
+        Path | None,
+        Option(metavar="DIR", help="Where results go; default in the run, or under runs."),
     ] = None,
     preset: options.Preset = None,
     population: options.Population = None,

@@ -22,7 +22,7 @@ from daq.identification.request import SettingsRequest
 from daq.identification.result import FittedLog, Identification, filter_noise, least_noise
 from daq.identification.selection import EVERYTHING, Selection
 from daq.identification.settings import Problem, gassi_settings, problem_of
-from daq.logs.capture import LOG_NAME
+from daq.logs.capture import LOG_NAME, VALIDATION
 from daq.logs.recording import Recording, log_path
 from daq.lookup.models import trust_option
 from daq.progress import Note, Progress, Watch, ignore, warn
@@ -150,6 +150,7 @@ def fit(
     train, ends = records.hold_back(train, problem.settings.hold_back)
     _require_information(problem, train)
     logs = train, [*ends, *check]
+    _tell_validation_runs(train, check, watch)
     if draft is not None:
         draft.begin(problem, logs)
     faults = faults_of(problem, logs)
@@ -214,6 +215,17 @@ def tell_starts(names: Iterable[str], watch: Watch) -> None:
             f"parameters; --set initial.{name}=first keeps it there"
         )
         watch(Note("note", text))
+
+
+def _tell_validation_runs(
+    train: Sequence[LoggedRecord], check: Sequence[LoggedRecord], watch: Watch
+) -> None:
+    """Tell which of the logs were recorded to validate by, where they are fitted as well."""
+    names = [log.dataset.name for log in train if log.of_a_rig]
+    names = [name for name in names if name.endswith(VALIDATION)]
+    if names and not check:
+        text = f"{', '.join(names)}: recorded to validate by, and fitted as well"
+        watch(Note("note", f"{text}; --validate RUN keeps a run out of the fit"))
 
 
 def _require_information(problem: Problem, train: Sequence[LoggedRecord]) -> None:

@@ -109,7 +109,7 @@ def expand(path: Path) -> list[Path]:
     if captures := sorted(log.parent for log in path.glob(f"*/{LOG_NAME}")):
         return [capture for capture in captures if _begun(capture / LOG_NAME)] or captures
     problem = "neither a capture folder (with log.csv) nor a folder of CSV files or captures"
-    raise ConfigError(problem, file=path)
+    raise ConfigError(problem, cure="name logs, or a folder that holds them", file=path)
 
 
 def intended_model(paths: Iterable[Path]) -> str | None:

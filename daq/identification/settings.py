@@ -258,8 +258,9 @@ def _without_nulls(file: File, models: Sequence[ProcessModel]) -> tuple[File, fr
             continue
         for name in entries:
             if entries[name] is None and name not in names:
-                problem = "the model has no such name; " + suggestion(str(name), names)
-                mistakes.append(file.mistake((group, str(name)), problem))
+                cure = suggestion(str(name), names)
+                key = group, str(name)
+                mistakes.append(file.mistake(key, "the model has no such name", cure))
         content[group] = {name: value for name, value in entries.items() if value is not None}
     check.refuse(mistakes)
     fixed = file.content.get("fixed")
@@ -443,10 +444,10 @@ def _unknown_names(
             added = "_of_" in name or (group == "weights" and file.content.get("outputs"))
             if before_additions and added:
                 continue
-            hint = f"model {whose} has no such name; {suggestion(name, declared)}"
             keyed = isinstance(entries, Mapping)
-            problem = hint if keyed else f"{name}: {hint}"
-            unknown.append(file.mistake((group, name) if keyed else (group,), problem))
+            problem = f"{'' if keyed else f'{name}: '}model {whose} has no such name"
+            key, cure = (group, name) if keyed else (group,), suggestion(name, declared)
+            unknown.append(file.mistake(key, problem, cure))
     return unknown
 
 
@@ -499,10 +500,12 @@ def _beyond_limits(file: YamlFile, fixed: Mapping[str, Any], model: ProcessModel
     for name, value in fixed.items():
         if name not in model.parameter_names or not isinstance(value, int | float):
             continue
-        try:
-            model.with_parameters(**{name: {"nominal": float(value), "fixed": True}})
-        except ModelError as error:
-            mistakes += file.error(("fixed", name), str(error)).mistakes
+        parameter = model.parameter(name)
+        if not parameter.minimum <= value <= parameter.maximum:
+            limits = f"{parameter.minimum:g} .. {parameter.maximum:g} {parameter.unit}"
+            problem = f"{value:g} is outside the physical limits of {name}, {limits}"
+            cure = "write a value within them, or search it: leave it out here"
+            mistakes.append(file.mistake(("fixed", name), problem, cure))
     return mistakes
 
 

@@ -22,6 +22,7 @@ from daq.process import RunProcess
 from daq.provenance import software_versions
 
 LOG_NAME = "log.csv"
+VALIDATION = "-validation"  # how the name of a run to validate by ends
 RUN_NAME = "run.json"
 
 _RESERVE = ".reserve"  # room for the last run.json on a disk that the log has filled

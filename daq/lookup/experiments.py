@@ -11,6 +11,7 @@ from daq.config.rig import RigConfig
 from daq.config.yaml_file import Key, YamlFile
 from daq.errors import ConfigError, Mistake
 from daq.experiment import Experiment, Plan
+from daq.logs.capture import VALIDATION
 from daq.lookup.classes import file_and_class, find_class
 from daq.lookup.shipped import find_file
 from daq.lookup.user_code import locate
@@ -46,7 +47,7 @@ class LoadedExperiment:
             return None
         file = _validation_file(self.file)
         experiment = _experiment(file, type(self.experiment))
-        return LoadedExperiment(file, experiment, f"{self.name}-validation")
+        return LoadedExperiment(file, experiment, f"{self.name}{VALIDATION}")
 
 
 def load_experiment(name: str, watch: Watch = ignore) -> LoadedExperiment:

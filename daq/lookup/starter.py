@@ -85,7 +85,7 @@ def _copy(files: Mapping[str, Path], name: str, option: str, kind: str) -> str:
     shipped = {path.stem: path for path in files.values()}
     if name not in shipped:
         cure = suggestion(name, list(shipped))
-        raise ConfigError(f"--{option}: no {name!r} to begin with", cure=cure)
+        raise ConfigError(f"no {name!r} to begin with", cure=cure, key=f"--{option}")
     text = shipped[name].read_text(encoding="utf-8")
     return f"{schemas.schema_comment(kind)}\n{schemas.without_schema_comment(text)}"
 

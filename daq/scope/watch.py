@@ -224,12 +224,11 @@ def _negative(value: Any) -> Any:
 def _log_of(named: Path) -> Path:
     log = log_path(named)
     if named.is_dir() and not log.exists() and not (named / RUN_NAME).exists():
-        raise ConfigError(
-            f"{named}: this folder holds no run (no {LOG_NAME}); name a run's folder or a CSV, "
-            "or follow the newest run of a folder with --out"
-        )
+        cure = "name a run's folder or a CSV, or follow the newest run of a folder with --out"
+        raise ConfigError(f"this folder holds no run (no {LOG_NAME})", cure=cure, file=named)
     if not named.exists():
-        raise ConfigError(f"{named}: there is no such run; name a run's folder or a CSV file")
+        cure = "name a run's folder or a CSV file"
+        raise ConfigError("there is no such run", cure=cure, file=named)
     return log
 
 

@@ -249,9 +249,12 @@ def test_runs_without_samples_are_left_out_of_a_figure_and_of_an_identification(
     assert (tmp_path / "all.png").exists()
     shutil.copy(lab / "coil.py", tmp_path)
     words = ("--model", "coil.py:coil", "--population", 10, "--generations", 5, "--json")
+    second = tmp_path / captures(lab)[1]
+    second.rename(f"{second}-validation")
     result = rig("identify", "runs", *words, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert len(json.loads(result.stdout)["metrics"]["training"]) == 2
+    assert f"{second.name}-validation: recorded to validate by, and fitted" in result.stderr
 
 
 def test_numbers_and_dates_that_were_edited_into_nonsense_end_no_listing(lab, tmp_path):

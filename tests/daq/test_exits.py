@@ -446,6 +446,22 @@ def test_with_json_a_mistaken_command_line_is_a_document_too(tmp_path, words, ke
     assert rig(*words, cwd=tmp_path).stdout == ""
 
 
+@pytest.mark.parametrize(
+    ("words", "place", "cure"),
+    [
+        (("scope", "nope"), ("nope", None), "name a run's folder"),
+        (("init", "--rig", "x"), (None, "--rig"), "known are"),
+        (("campaign", "."), (".", None), "name logs"),
+        (("identify", "log.csv", "--set", "fixed.K_mm=3"), (None, "--set fixed.K_mm"), "did you mean"),
+        (("identify", "log.csv", "--set", "fixed.R_m=-5"), (None, "--set fixed.R_m"), "within them"),
+    ],
+)
+def test_file_key_and_cure_stand_in_places_of_their_own(tmp_path, words, place, cure):
+    (error,) = json.loads(rig(*words, "--json", cwd=tmp_path).stdout)["errors"]
+    assert (error["file"], error["key"]) == place and cure in error["cure"]
+    assert not {"nope", "--rig", "did you mean", "--set"} & set(error["error"].split())
+
+
 def test_a_document_is_printed_once(tmp_path):
     result = rig("ports", "/dev/no-such-port", "--json", cwd=tmp_path)
     assert result.returncode == 2
