@@ -334,7 +334,7 @@ CASES = [
     settings("values, names, units and ties that are wrong, all at once",
              "fixed: {R_m: -5, K_nix: 3}\nranges: {J_m: [1 V, 2 V]}\nweights: {omegga: 2}\n"
              "initial: {zz: 0.1}\ntied: {c1: c0 * unknown}\nprofile: [nonsense]\n",
-             "id.yaml:1:9: fixed.R_m: -5 is outside the physical limits of R_m, 0 .. inf ohm; write a value",
+             "id.yaml:1:9: fixed.R_m: -5 is outside the physical limits of R_m, 0 .. inf ohm",
              "id.yaml:1:18: fixed.K_nix: model actuator has no such name; did you mean 'K_v2i'?",
              "id.yaml:2:10: ranges.J_m: 'V' does not convert to 'kg*m^2'",
              "id.yaml:3:11: weights.omegga: model actuator has no such name; did you mean 'omega'",
@@ -343,7 +343,7 @@ CASES = [
              "id.yaml:6:1: profile: nonsense: model actuator has no such name"),
     settings("values that are wrong beside keys that nobody knows",
              "fixed: {R_m: -5}\npopulaton: 9\nranges: {L_m: [5, 1]}\n",
-             "id.yaml:1:9: fixed.R_m: -5 is outside the physical limits of R_m, 0 .. inf ohm; write a value",
+             "id.yaml:1:9: fixed.R_m: -5 is outside the physical limits of R_m, 0 .. inf ohm",
              "id.yaml:2:1: populaton: unknown key",
              "id.yaml:3:10: ranges.L_m: low end 5 is not below high end 1"),
     settings("additions, channels, data sheets and results of before that are wrong, all at once",

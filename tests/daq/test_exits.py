@@ -452,8 +452,16 @@ def test_with_json_a_mistaken_command_line_is_a_document_too(tmp_path, words, ke
         (("scope", "nope"), ("nope", None), "name a run's folder"),
         (("init", "--rig", "x"), (None, "--rig"), "known are"),
         (("campaign", "."), (".", None), "name logs"),
-        (("identify", "log.csv", "--set", "fixed.K_mm=3"), (None, "--set fixed.K_mm"), "did you mean"),
-        (("identify", "log.csv", "--set", "fixed.R_m=-5"), (None, "--set fixed.R_m"), "within them"),
+        (
+            ("identify", "log.csv", "--set", "fixed.K_mm=3"),
+            (None, "--set fixed.K_mm"),
+            "did you mean",
+        ),
+        (
+            ("identify", "log.csv", "--set", "fixed.R_m=-5"),
+            (None, "--set fixed.R_m"),
+            "within them",
+        ),
     ],
 )
 def test_file_key_and_cure_stand_in_places_of_their_own(tmp_path, words, place, cure):
