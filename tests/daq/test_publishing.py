@@ -158,6 +158,7 @@ def test_the_page_needs_nothing_else(page, work):
     assert all(address.startswith(("#", "data:")) for address in page.addresses)
     assert not {"script", "link", "iframe", "img", "object"} & set(page.tags)
     assert "@import" not in text
+    assert "on that side alone" not in text, "no interval has one end"
     assert "first 50 lags" not in text, "three time constants are 30 samples, and all are tested"
     assert page.open == []
     assert len(set(page.ids)) == len(page.ids)
@@ -208,6 +209,7 @@ def test_gaps_of_an_output_do_not_take_away_the_frequency_response_of_another(tm
     assert drawn == {"bode-y"}
     page = (tmp_path / "found/report.html").read_text()
     assert "No frequency response of z is drawn" in page
+    assert "<th>note</th>" not in page, "there are none"
     # The slow state remembers for three seconds, of which residuals are drawn.
     assert "shares are of the first 50 lags" in page
 
