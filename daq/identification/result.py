@@ -22,7 +22,7 @@ from daq.identification.remedies import remedies
 from daq.identification.request import PARAMETERS, resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem, setting_of
-from daq.lookup.models import trust_option
+from daq.lookup.models import trust_option, without_folders
 from daq.notation import quantity
 from daq.provenance import software_versions
 from daq.views import Lines, Shown
@@ -111,7 +111,8 @@ class Identification(Shown):
     def headline(self) -> str:
         """The model, its logs, and what may be used."""
         names = ", ".join(log.name for logs in self.rows.logs.values() for log in logs)
-        return f"{self.problem.model_name} from {names}: {self.verdict.headline}"
+        model = self.problem.model_name
+        return f"{without_folders([model])[model]} from {names}: {self.verdict.headline}"
 
     def lines(self) -> Lines:
         """Parameters and combinations with their 95 % intervals, and fits."""
