@@ -377,7 +377,8 @@ class Identification(Shown):
         """Errors of the free runs, a row for each part, log and output.
 
         rmse and msd in parts of the largest measured value, rmse_absolute and msd_absolute in the
-        output's unit, fit_percent 100 for a perfect one.
+        output's unit, fit_percent 100 for a perfect one. A narrow terminal shows all columns by
+        ``print(result.metrics.to_string())``.
         """
         import pandas as pd
 
