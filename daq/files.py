@@ -22,6 +22,16 @@ def write_whole(path: Path, content: str | bytes) -> None:
         raise RunError(f"cannot be written: {reason}", file=path) from None
 
 
+def require_target(path: Path, suffix: str) -> None:
+    """Raise ConfigError where a file of a format, ``.mat``, cannot be meant to stand at a path."""
+    if path.suffix.lower() not in ("", suffix):
+        cure = f"name it {path.with_suffix(suffix).name}"
+        raise ConfigError(f"a file of this format ends in {suffix}", cure=cure, file=path)
+    if not path.parent.is_dir():
+        problem = f"cannot be written: there is no folder {path.parent}, make it first"
+        raise ConfigError(problem, cure="or choose another place with --out FILE", file=path)
+
+
 def digest(path: Path) -> str:
     """SHA-256 of a file's content, by which it is known again."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

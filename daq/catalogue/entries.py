@@ -15,6 +15,7 @@ from typing import Any
 from pydantic_core import from_json
 
 from daq.config import json_file, yaml_file
+from daq.config.metadata import FACTS
 from daq.errors import RigError
 from daq.identification.request import PARAMETERS
 from daq.identification.rows import ParameterRow, QuantityRow, Rows
@@ -58,7 +59,7 @@ class RunEntry:
     @property
     def described(self) -> dict[str, Any]:
         """What is known of it without its identification's numbers, by key."""
-        return {**self.metadata, **{key: getattr(self, key) for key in _TEXTS}}
+        return {**self.metadata, **{key: getattr(self, key) for key in FACTS}}
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -67,7 +68,7 @@ class RunEntry:
 
     def fact(self, key: str) -> Any:
         """One of the facts; None where it is not known."""
-        if key in _TEXTS:
+        if key in FACTS:
             return getattr(self, key)
         return self.metadata[key] if key in self.metadata else self.values.get(key)
 
@@ -86,9 +87,6 @@ class RunEntry:
     def quantity(self, name: str) -> QuantityRow | None:
         """An identified parameter or combination; None where it has none of that name."""
         return next((row for row in self.quantities if row.name == name), None)
-
-
-_TEXTS = [f.name for f in fields(RunEntry) if f.name not in ("metadata", "rows", "problems")]
 
 
 def captures(root: Path) -> Iterator[tuple[str, str]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.catalogue.entries import RunEntry
+from daq.config.metadata import SYNONYMS
 from daq.errors import ConfigError, suggestion
 
 _CONDITION = re.compile(r"\s*([^<>=!]+?)\s*(<=|>=|!=|=|<|>)\s*(.*?)\s*", re.DOTALL)
@@ -21,7 +22,6 @@ _ORDERS: dict[str, Callable[[Any, Any], bool]] = {
     ">": operator.gt,
     ">=": operator.ge,
 }
-_SINGULAR = {"tag": "tags", "run": "folder"}  # other names of facts
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,17 @@ def _parsed(root: Path, entries: Sequence[RunEntry], terms: Iterable[str]) -> Qu
             key = _require_key(entries, condition[1], term)
             conditions.append(_checked(entries, Condition(key, condition[2], condition[3])))
         else:
-            words.append(term.casefold())
+            words.append(_word(entries, term))
     return Query(frozenset(folders), tuple(conditions), tuple(words))
+
+
+def _word(entries: Sequence[RunEntry], term: str) -> str:
+    """A term as a word of some run; ConfigError for a path that is no folder, nor part of one's."""
+    word = term.casefold()
+    if "/" in term and not any(word in text for entry in entries for text in _texts(entry)):
+        cure = "rig runs lists the runs, of another folder with --in"
+        raise ConfigError("there is no such folder of a run", cure=cure, file=term)
+    return word
 
 
 def _folder(root: Path, term: str) -> str | None:
@@ -158,7 +167,7 @@ def _checked(entries: Sequence[RunEntry], condition: Condition) -> Condition:
 
 
 def _require_key(entries: Sequence[RunEntry], key: str, place: str) -> str:
-    key = _SINGULAR.get(key, key)
+    key = SYNONYMS.get(key, key)
     if entries and all(entry.fact(key) is None for entry in entries):
         keys = list(dict.fromkeys(k for entry in entries for k in entry.facts))
         raise ConfigError(f"no run has {key!r}", cure=suggestion(key, keys), key=place)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument
 
+from daq import notation
 from daq.cli import options, terminal
 from daq.identification.rows import QuantityRow
 
@@ -67,7 +68,7 @@ def show_findings(findings: Findings, folder: Path) -> None:
         units = {name: f" [{unit}]" for name, unit in table.units.items()}
         heads = [f"{name}{units.get(name, '')}" for name in table.columns]
         rows = zip(*(values.tolist() for values in table.columns.values()), strict=True)
-        terminal.print_table(table.title, heads, [list(map(terminal.number, row)) for row in rows])
+        terminal.print_table(table.title, heads, [list(map(_plain, row)) for row in rows])
     for remark in findings.remarks:
         terminal.print_text(remark)
     print(f"Results: {folder / RESULTS}")
@@ -82,7 +83,12 @@ def _number_row(number: Number) -> list[str]:
     scale, unit = row.engineering
 
     def write(value: float) -> str:
-        return row.text(value, scale) if interval else terminal.number(scale * value)
+        return row.text(value, scale) if interval else _plain(scale * value)
 
     ends = row.interval_text(write, between=" .. ", empty="-")
     return [number.name, write(number.value), ends, unit, number.meaning]
+
+
+def _plain(value: float) -> str:
+    """A number that nothing says the precision of: four digits, or as few as it has."""
+    return min(terminal.number(value), notation.shortest(value), key=len)

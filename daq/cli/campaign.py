@@ -68,24 +68,23 @@ def campaign(
 
 
 def _show(result: CampaignResult) -> None:
-    from daq.lookup.models import trust_option, without_folders
+    from daq.lookup.models import trust_option
 
     runs = result.campaign
     print()
     models = [outcome.run.model for outcome in runs.outcomes]
     units = {output.name: output.unit for model in models for output in model.outputs}
     spreads = runs.spread()
-    shown = without_folders(spread.model for spread in spreads)
     terminal.print_table_of_differences(
         "Error over seeds: mean over outputs of the RMSE in parts of max|y|",
         ["model", "log", "runs", "best", "median", "worst", "within 1 %", "failed"],
-        [[shown[spread.model], *_spread_row(spread)] for spread in spreads],
+        [[spread.model, *_spread_row(spread)] for spread in spreads],
         once=["model", "runs", "within 1 %", "failed"], text=["log"],
     )  # fmt: skip
     terminal.print_table_of_differences(
         "The best of each: mean fit, and RMSE in the outputs' units",
         ["model", "log", "fit [%]", *(f"{name} [{unit}]" for name, unit in units.items())],
-        [[shown[spread.model], *_best_row(spread, result, list(units))] for spread in spreads],
+        [[spread.model, *_best_row(spread, result, list(units))] for spread in spreads],
         once=["model"], text=["log"],
     )  # fmt: skip
     for problem in dict.fromkeys(f"{o.run.name}, {o.run.data}: {o.problem}" for o in runs.failed):
@@ -93,7 +92,7 @@ def _show(result: CampaignResult) -> None:
     if runs.interrupted:
         print(f"Stopped by Ctrl-C: {len(runs.outcomes)} runs are in the table.")
     for (model, data), path in result.files.items():
-        print(f"Best of {shown.get(model, model)} on {data}: {path}")
+        print(f"Best of {model} on {data}: {path}")
     print(f"All runs with their parameters: {result.table}")
     for (model, _), path in list(result.files.items())[:1]:
         terminal.print_next(

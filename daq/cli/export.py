@@ -52,9 +52,12 @@ def export_parquet(log: Log, out: Target = None, json: options.AsJson = False) -
 
 
 def _export_log(log: Path, out: Path | None, kind: str, json: bool) -> None:
+    from daq.files import require_target
     from daq.logs.formats import WRITERS
     from daq.logs.recording import load_whole
 
+    if out is not None:
+        require_target(out, f".{kind}")
     recording = load_whole(log)
     file = out or recording.path.with_suffix(f".{kind}")
     WRITERS[kind](recording, file)
@@ -82,9 +85,12 @@ def export_fmu(
     compiles to; whoever simulates it needs no Python. Parameters and starts can be set, inputs are
     held over a step.
     """
+    from daq.files import require_target
     from daq.fmu.export import export
     from daq.identification.request import result_file
 
+    if out is not None:
+        require_target(out, ".fmu")
     file = result_file(result)
     unit = export(file, trust=trust)
     path = unit.save(out or file.with_name(f"{unit.identifier}.fmu"))

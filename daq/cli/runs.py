@@ -110,7 +110,9 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str, room: i
         terminal.report("note", f"the last {room} are shown; --last N shows so many")
         entries = entries[-room:]
     noted = list(dict.fromkeys(key for entry in entries for key in entry.metadata))
-    head = ["run", "date (UTC)", *_FACTS, *names, *noted]
+    units = {row.name: row.unit for entry in entries for row in entry.quantities}
+    titles = [f"{name} [{units[name]}]" if name in units else name for name in names]
+    head = ["run", "date (UTC)", *_FACTS, *titles, *noted]
     rows = [
         [
             entry.folder,
@@ -126,7 +128,7 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str, room: i
         kept.remove(1)
     if sys.stdout.isatty():
         kept = _with_room(kept, head, rows, noted)
-    texts = [name for name in head if name not in names]
+    texts = [name for name in head if name not in titles]
     terminal.print_table_of_differences(
         title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows],
         once=texts[1:], text=texts,

@@ -13,6 +13,12 @@ from daq.config.base import Section
 _KEY = re.compile(r"[^\W\d]\w*")
 _ASSIGNMENT = re.compile(rf"\s*({_KEY.pattern})\s*=(.*)", re.DOTALL)
 _LONGEST = 2000  # characters of a value
+FACTS = (
+    "folder", "started", "status", "reason", "protocol", "rig", "device", "model", "trust",
+    "predictions", "parameters",
+)  # fmt: skip
+"""What a run is known by without being noted: nothing can be noted under these keys."""
+SYNONYMS = {"tag": "tags", "run": "folder"}  # by which a catalogue is asked as well
 
 
 class Metadata(Section):
@@ -40,6 +46,9 @@ class Metadata(Section):
         for key, value in (self.model_extra or {}).items():
             if not _KEY.fullmatch(key):
                 raise ValueError(f"{key!r} is no key; write letters, digits and underscores")
+            if key in FACTS or key in SYNONYMS:
+                meant = SYNONYMS.get(key, key)
+                raise ValueError(f"{key!r} means the run's own {meant}; choose another key")
             if not isinstance(value, str | int | float):
                 raise ValueError(f"{key}: {value!r} is neither text nor a number")
             if isinstance(value, str) and len(value) > _LONGEST:

@@ -11,10 +11,10 @@ from daq import notation
 from daq.figures import style
 from daq.hal import FloatArray
 
+BoolArray = npt.NDArray[np.bool_]
 ComplexArray = npt.NDArray[np.complex128]
 _MEASURED, _IDENTIFIED = "measured, 95 %", "identified"
 _Z95 = 1.959963984540054
-_SEEN = 0.3  # coherence below which a measured point is drawn faintly
 
 
 @style.styled
@@ -23,6 +23,7 @@ def bode(
     response: ComplexArray,
     coherence: FloatArray,
     deviation: FloatArray,
+    significant: BoolArray,
     identified: ComplexArray | None,
     band: FloatArray,
     linear: Mapping[str, ComplexArray],
@@ -31,10 +32,10 @@ def bode(
     """Magnitude, phase and coherence over frequencies [Hz], (n,).
 
     response, coherence, deviation: as estimated, (n,), with a magnitude's standard deviation.
-    identified: of the model, by the same estimate. linear: of linear models by name, at the
+    significant: (n,), where they are more than noise; other points are left out. identified: of
+    the model, by the same estimate, with the same gaps. linear: of linear models by name, at the
     frequencies ``band`` [Hz], (m,). units: of output and input. Measured magnitudes carry 95 %
-    bars; points of low coherence are faint, and what is identified has gaps there. Phases do not
-    jump by a turn where there is a linear model to go by.
+    bars. Phases do not jump by a turn where there is a linear model to go by.
     """
     estimates = {} if identified is None else {_IDENTIFIED: identified}
     names = [*estimates, *linear]
@@ -42,31 +43,25 @@ def bode(
         [1.1, 0.8, 0.45], 0.1, top=style.legend_room([_MEASURED, *names])
     )
     magnitude = np.abs(response)
-    good = coherence >= _SEEN
-    visible = good if good.any() else np.ones(len(good), dtype=bool)
     smooth = _smooth_phase(linear)
     phase = _phase(response, frequency, band, smooth)
-    for chosen, colour in ((~good, style.FAINT), (good, style.MEASURED)):
-        if not chosen.any():
-            continue
-        bars = _Z95 * deviation[chosen]
-        lower = np.minimum(bars, 0.98 * magnitude[chosen])
-        size.errorbar(
-            frequency[chosen], magnitude[chosen], yerr=[lower, bars], fmt="none",
-            ecolor=colour, elinewidth=0.4,
-        )  # fmt: skip
-        size.plot(frequency[chosen], magnitude[chosen], ".", ms=2.5, color=colour,
-                  label=_MEASURED if colour == style.MEASURED else None)  # fmt: skip
-        angle.plot(frequency[chosen], phase[chosen], ".", ms=2.5, color=colour)
-    phases = [phase[good]]
-    drawn = [(frequency, np.where(visible, each, np.nan)) for each in estimates.values()]
+    at, heights = frequency[significant], magnitude[significant]
+    bars = _Z95 * deviation[significant]
+    size.errorbar(
+        at, heights, yerr=[np.minimum(bars, 0.98 * heights), bars], fmt="none",
+        ecolor=style.MEASURED, elinewidth=0.4,
+    )  # fmt: skip
+    size.plot(at, heights, ".", ms=2.5, color=style.MEASURED, label=_MEASURED)
+    angle.plot(at, phase[significant], ".", ms=2.5, color=style.MEASURED)
+    phases = [phase[significant]]
+    drawn = [(frequency, np.where(significant, each, np.nan)) for each in estimates.values()]
     drawn += [(band, each) for each in linear.values()]
-    for k, (name, (at, curve)) in enumerate(zip(names, drawn, strict=True)):
+    for k, (name, (points, curve)) in enumerate(zip(names, drawn, strict=True)):
         look = {"color": style.CYCLE[(1, 0, 2, 3)[k % 4]], "ls": style.DASHES[k % 4]}
-        size.plot(at, np.abs(curve), label=name, **look)  # type: ignore[arg-type]
-        phases.append(_phase(curve, at, band, smooth))
-        angle.plot(at, phases[-1], **look)  # type: ignore[arg-type]
-    limits = _limits(magnitude, good, [*estimates.values(), *linear.values()])
+        size.plot(points, np.abs(curve), label=name, **look)  # type: ignore[arg-type]
+        phases.append(_phase(curve, points, band, smooth))
+        angle.plot(points, phases[-1], **look)  # type: ignore[arg-type]
+    limits = _limits(heights, [*estimates.values(), *linear.values()])
     size.set_ylim(*limits)
     style.logarithmic(size.yaxis, np.array(limits))
     shown = np.concatenate(phases)
@@ -108,13 +103,10 @@ def _limit_phase(angle: Axes, degrees: FloatArray) -> None:
     angle.set_ylim(ticks[0] - 10.0, ticks[-1] + 10.0)
 
 
-def _limits(
-    magnitude: FloatArray, good: npt.NDArray[np.bool_], curves: Sequence[ComplexArray]
-) -> tuple[float, float]:
+def _limits(magnitude: FloatArray, curves: Sequence[ComplexArray]) -> tuple[float, float]:
     """Limits by what is credible: neither bars that reach to zero nor a curve's notch."""
-    credible = magnitude[good] if good.any() else magnitude
     middles = [float(np.median(np.abs(values))) for values in curves]
-    every = np.concatenate([credible[credible > 0.0], [m for m in middles if m > 0.0]])
+    every = np.concatenate([magnitude[magnitude > 0.0], [m for m in middles if m > 0.0]])
     if not len(every):
         return 0.1, 1.0
     return 0.4 * float(every.min()), 2.5 * float(every.max())

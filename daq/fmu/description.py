@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -81,12 +82,15 @@ class Variables:
                 yield row
 
 
-def model_description(variables: Variables, identifier: str, token: str) -> str:
-    """``modelDescription.xml`` of FMI 3.0."""
+def model_description(
+    variables: Variables, identifier: str, token: str, generated: datetime.datetime
+) -> str:
+    """``modelDescription.xml`` of FMI 3.0; generated: when, with its time zone."""
     model, version = variables.model, software_versions()["hybrid-rig"]
+    date = generated.astimezone(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     root = ET.Element("fmiModelDescription", fmiVersion="3.0", modelName=model.name,
                       instantiationToken=token, generationTool=f"hybrid-rig {version}",
-                      variableNamingConvention="flat")  # fmt: skip
+                      generationDateAndTime=date, variableNamingConvention="flat")  # fmt: skip
     if model.description:
         root.set("description", model.description)
     simulation = ET.SubElement(root, "CoSimulation", modelIdentifier=identifier)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 import io
 import platform
@@ -103,8 +104,11 @@ def unit_of(
     *,
     compiler: str | None = "cc",
     resources: dict[str, bytes] | None = None,
+    generated: datetime.datetime | None = None,
 ) -> MockupUnit:
     """A model at given parameters. Raises ConfigError for equations that have no C.
+
+    generated: the date in its description, with its time zone; None for now.
 
     >>> from sysid.examples import lag
     >>> unit = unit_of(lag(), lag().nominal, compiler=None)
@@ -144,7 +148,8 @@ def unit_of(
     binary = None
     if compiler is not None and place is not None and shutil.which(compiler):
         binary = _compiled(source, compiler)
-    description = model_description(variables, identifier, token)
+    generated = generated or datetime.datetime.now(datetime.UTC)
+    description = model_description(variables, identifier, token, generated)
     return MockupUnit(identifier, description, source, place, binary, resources or {})
 
 

@@ -55,9 +55,13 @@ class Workers:
 
 @dataclass(frozen=True)
 class Group:
-    """Logs that one parameter set is fitted to, and those it is validated on, for one model."""
+    """Logs that one parameter set is fitted to, and those it is validated on, for one model.
+
+    model_name: as tables show it, a file without its folder.
+    """
 
     problem: Problem
+    model_name: str
     name: str
     training: list[LoggedRecord]
     validation: list[LoggedRecord]
@@ -70,7 +74,7 @@ class Group:
     def runs(self, seeds: Sequence[int]) -> list[Run]:
         """One run for each seed."""
         problem, settings = self.problem, gassi_settings(self.problem)
-        names, (training, validation) = (problem.model_name, self.name), self.datasets
+        names, (training, validation) = (self.model_name, self.name), self.datasets
         return [Run(problem.model, training, settings, seed, *names, validation) for seed in seeds]
 
     def result(self, outcome: Outcome) -> Identification:
@@ -177,7 +181,7 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
             stop.add_note(f"they stand in {_write_table(folder, Campaign(tuple(outcomes)))}")
         raise
     table = _write_table(folder, result)
-    by_key = {(group.problem.model_name, group.name): group for group in groups}
+    by_key = {(group.model_name, group.name): group for group in groups}
     best, files = result.best(), {}
     for place, (key, outcome) in enumerate(best.items(), 1):
         files[key] = by_key[key].result(outcome).save(folder / f"best-{place}")
@@ -195,9 +199,11 @@ def _all_groups(wanted: CampaignRequest, watch: Watch) -> list[Group]:
         names = [None] * len(sets)
     with_validation = [[*logs, *wanted.validate] for logs in sets]
     problems = problems_of(wanted.settings, names, watch, logs_of=with_validation)
+    shown = without_folders(problem.model_name for problem in problems)
     groups = []
     for problem, logs in zip(problems, sets, strict=True):
-        groups += groups_of(problem, logs, wanted.validate, wanted.together)
+        name = shown[problem.model_name]
+        groups += groups_of(problem, name, logs, wanted.validate, wanted.together)
     return groups
 
 
@@ -219,7 +225,6 @@ def run_all(
     ]
     warn(watch, *dict.fromkeys(doubts))
     runs = [run for group in groups for run in group.runs(seeds)]
-    names = without_folders(run.name for run in runs)
     finished = 0
 
     def report(outcome: Outcome) -> None:
@@ -227,7 +232,7 @@ def run_all(
         finished += 1
         on_outcome(outcome)
         end = "failed" if outcome.problem else f"error {outcome.error:.3g}"
-        of_run = f"{names[outcome.run.name]}, seed {outcome.run.seed}: {end}"
+        of_run = f"{outcome.run.name}, seed {outcome.run.seed}: {end}"
         status = f"{finished}/{len(runs)} runs, {of_run}"
         watch(Progress("Identification", finished, len(runs), status))
 
@@ -249,9 +254,16 @@ def run_all(
 
 
 def groups_of(
-    problem: Problem, logs: Sequence[Path], validate: Sequence[Path], together: bool
+    problem: Problem,
+    model_name: str,
+    logs: Sequence[Path],
+    validate: Sequence[Path],
+    together: bool,
 ) -> list[Group]:
-    """The logs for one model, each by itself or all together, less what is held back of them."""
+    """The logs for one model, each by itself or all together, less what is held back of them.
+
+    model_name: as tables show it.
+    """
     training, validation = load_logs(problem, logs, validate)
     sets = list(zip(_log_names(training), [[log] for log in training], strict=True))
     if together and len(training) != 1:
@@ -259,7 +271,7 @@ def groups_of(
     groups = []
     for name, train in sets:
         begins, ends = records.hold_back(train, problem.settings.hold_back)
-        groups.append(Group(problem, name, begins, [*ends, *validation]))
+        groups.append(Group(problem, model_name, name, begins, [*ends, *validation]))
     return groups
 
 

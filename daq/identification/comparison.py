@@ -24,6 +24,7 @@ from daq.identification.fit import check_writable, default_folder
 from daq.identification.request import SettingsRequest
 from daq.identification.result import Identification
 from daq.identification.settings import problems_of
+from daq.lookup.models import without_folders
 from daq.progress import Watch, ignore, warn
 from daq.provenance import software_versions
 from daq.views import Lines, Shown
@@ -92,7 +93,8 @@ class ComparisonResult(Shown):
     """Structures ranked by validation.
 
     group: the logs, as the first model used them. candidates: with their free runs. files:
-    parameters by model. request_words: what the command line named besides models and logs.
+    parameters by model. models: the names by which they are found from any folder, by those that
+    are shown. request_words: what the command line named besides models and logs.
 
     >>> from daq import ComparisonRequest, compare, record
     >>> quick = SettingsRequest(options={"preset": "thesis", "generations": 3})
@@ -107,6 +109,7 @@ class ComparisonResult(Shown):
     candidates: Sequence[Candidate]
     campaign: Campaign
     files: Mapping[str, Path]
+    models: Mapping[str, str]
     folder: Path
     request_words: Sequence[str]
 
@@ -183,13 +186,17 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     if wanted.out is None and not alone:
         folder = folder.with_name("comparison")
     check_writable(folder)
-    groups = [groups_of(p, wanted.logs, wanted.validate, together=True)[0] for p in problems]
+    shown = without_folders(problem.model_name for problem in problems)
+    groups = [
+        groups_of(p, shown[p.model_name], wanted.logs, wanted.validate, together=True)[0]
+        for p in problems
+    ]
     _require_same_outputs(groups)
     campaign = run_all(groups, seeds, wanted.workers, watch, lambda outcome: None)
     best = {name: outcome for (name, _), outcome in campaign.best().items()}
-    fitted = [g for g in groups if g.problem.model_name in best]
+    fitted = [g for g in groups if g.model_name in best]
     if alone:
-        result = fitted[0].result(best[fitted[0].problem.model_name])
+        result = fitted[0].result(best[fitted[0].model_name])
         (spread,) = campaign.spread()
         result = replace(result, folder=folder, seeds=_spread_document(spread))
         result.save(folder)
@@ -199,11 +206,14 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     files = {
         name: group.result(best[name]).save(folder / _folder_name(place, name))
         for place, group in enumerate(fitted, 1)
-        if (name := group.problem.model_name)
+        if (name := group.model_name)
     }
     words = [f"--{name.lower()}" for name in wanted.baselines]
     words += ["--seeds", wanted.seeds] if wanted.seeds is not None else ["--seed", f"{seeds[0]}"]
-    compared = ComparisonResult(ranking, groups[0], candidates, campaign, files, folder, words)
+    models = {group.model_name: group.problem.model_name for group in fitted}
+    compared = ComparisonResult(
+        ranking, groups[0], candidates, campaign, files, models, folder, words
+    )
     text = yaml.safe_dump(dict(compared.document), sort_keys=False, allow_unicode=True)
     write_whole(compared.file, text)
     return compared
@@ -229,7 +239,7 @@ def _candidates(
     """Every structure fitted, with its free runs."""
     candidates = []
     for group in groups:
-        name = group.problem.model_name
+        name = group.model_name
         estimator = best[name].estimator
         assert estimator is not None
         candidates.append(Candidate.of(name, estimator, *group.datasets))

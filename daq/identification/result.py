@@ -22,7 +22,7 @@ from daq.identification.remedies import remedies
 from daq.identification.request import PARAMETERS, resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem, setting_of
-from daq.lookup.models import trust_option
+from daq.lookup.models import trust_option, without_folders
 from daq.notation import quantity
 from daq.provenance import software_versions
 from daq.views import Lines, Shown
@@ -35,6 +35,7 @@ from sysid.problem.model import Parameter
 if TYPE_CHECKING:
     import pandas as pd
 
+    from daq.identification.verdict import ShownVerdict
     from sysid.gassi import GASSI
     from sysid.judging.assessment import RecordResult, Verdict
     from sysid.judging.examination import Suspicion
@@ -110,18 +111,12 @@ class Identification(Shown):
     def headline(self) -> str:
         """The model, its logs, and what may be used."""
         names = ", ".join(log.name for logs in self.rows.logs.values() for log in logs)
-        statements = self.verdict.predicted.trust, self.verdict.parameters.trust
-        verdict = f"predictions {statements[0]}, parameters {statements[1]}"
-        return f"{self.problem.model_name} from {names}: {verdict}"
+        model = self.problem.model_name
+        return f"{without_folders([model])[model]} from {names}: {self.verdict.headline}"
 
     def lines(self) -> Lines:
-        """Parameters with their 95 % intervals."""
-        rows = [["parameter", "value", "95 % interval", "unit", ""]]
-        for row in self.rows.parameters:
-            scale, unit = row.engineering
-            note = row.held or row.undetermined_label
-            rows.append([row.name, row.text(row.value, scale), row.span(scale), unit, note])
-        return rows
+        """Parameters and combinations with their 95 % intervals, and fits."""
+        return self.rows.lines()
 
     @property
     def model(self) -> ProcessModel:
@@ -129,13 +124,14 @@ class Identification(Shown):
         return self.problem.model
 
     @cached_property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> ShownVerdict:
         """How well outputs are predicted, whether parameters may be used, and why."""
+        from daq.identification.verdict import ShownVerdict
         from sysid.judging.assessment import judge
 
         parts, suspicion = (self.training, self.validation), self.suspicion
         training, validation = ([log.result for log in part] for part in parts)
-        return judge(
+        verdict = judge(
             self.model,
             training,
             validation,
@@ -145,6 +141,7 @@ class Identification(Shown):
             findings=None if suspicion is None else suspicion.findings,
             alternative=None if suspicion is None else suspicion.alternative,
         )
+        return ShownVerdict(verdict.predicted, verdict.parameters, verdict.notes)
 
     @property
     def trust(self) -> str:
@@ -380,7 +377,8 @@ class Identification(Shown):
         """Errors of the free runs, a row for each part, log and output.
 
         rmse and msd in parts of the largest measured value, rmse_absolute and msd_absolute in the
-        output's unit, fit_percent 100 for a perfect one.
+        output's unit, fit_percent 100 for a perfect one. A narrow terminal shows all columns by
+        ``print(result.metrics.to_string())``.
         """
         import pandas as pd
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from daq import notation
 from daq.notation import percent, quantity
+from daq.views import Lines, Shown
 
 _Z95 = 1.96
 LABELS = {  # of undetermined reasons
@@ -268,8 +269,8 @@ class ResidualTable:
     shares: Mapping[str, tuple[float, ...]]
 
 
-@dataclass(frozen=True)
-class Rows:
+@dataclass(frozen=True, repr=False)
+class Rows(Shown):
     """Tables of an identification.
 
     rivals: other minima that explain the data as well. correlations: of parameters that have an
@@ -352,7 +353,7 @@ class Rows:
         return tuple(ambiguity for ambiguity in self.ambiguities if ambiguity.kind in kinds)
 
     @property
-    def determined_sentence(self) -> str:
+    def headline(self) -> str:
         """How many parameters are known by themselves, and how many otherwise."""
         parts = [f"{len(self.determined)} of {len(self.free)} free parameters by themselves"]
         if self.bounded:
@@ -361,7 +362,28 @@ class Rows:
             n = len(self.combinations)
             parts.append(f"{n} combination{'' if n == 1 else 's'} of others")
         last = f" and {parts.pop()}" if len(parts) > 1 else ""
-        return f"Determined: {', '.join(parts)}{last}."
+        return f"{', '.join(parts)}{last}"
+
+    def lines(self) -> Lines:
+        """Parameters and combinations with their 95 % intervals, and the fit of each output."""
+        lines = [["quantity", "value", "95 % interval", "unit", ""]]
+        notes = [row.held or row.undetermined_label for row in self.parameters]
+        notes += [""] * len(self.combinations)
+        for row, note in zip((*self.parameters, *self.combinations), notes, strict=True):
+            scale, unit = row.engineering
+            lines.append([row.name, row.text(row.value, scale), row.span(scale), unit, note])
+        lines += [
+            [f"fit of {output}", percent(errors.fit_percent), "-", "%", f"{part}, {log.name}"]
+            for part, logs in self.logs.items()
+            for log in logs
+            for output, errors in log.outputs.items()
+        ]
+        return lines
+
+    @property
+    def determined_sentence(self) -> str:
+        """The headline as a sentence."""
+        return f"Determined: {self.headline}."
 
     @property
     def together_sentence(self) -> str:

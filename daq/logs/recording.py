@@ -173,8 +173,10 @@ def load_whole(path: str | Path) -> Recording:
     """A log as ``load`` reads it, with every column that it has; ConfigError for a foreign one."""
     csv = log_path(Path(path))
     present = column_names(csv) if csv.exists() else ()
-    if present and not set(COLUMNS) & set(present):
-        problem = f"no column of it is one that 'rig run' logs: it has {', '.join(present)}"
+    missing = [name for name in ORIGINAL_COLUMNS if name not in present]
+    if present and missing:
+        problem = f"it is no log of 'rig run', without {', '.join(missing)}: it has "
+        problem += ", ".join(present)
         cure = "name a capture folder; logs of other programs are for rig identify and rig replay"
         raise ConfigError(problem, cure=cure, file=csv)
     return load(path, [name for name in present if name not in COLUMNS])

@@ -33,8 +33,6 @@ def publish_comparison(result: ComparisonResult) -> str:
     ]
     now = datetime.datetime.now(datetime.UTC)
     preferred = next(row for row in document["structures"] if row["name"] == document["preferred"])
-    fitted = {row["name"] for row in document["structures"] if "parameters_file" in row}
-    models = [candidate.name for candidate in result.candidates if candidate.name in fitted]
     logs = group.training, group.validation
     variables = {
         "written": f"{now:%Y-%m-%d %H:%M} UTC",
@@ -44,7 +42,9 @@ def publish_comparison(result: ComparisonResult) -> str:
         "preferred_file": preferred.get("parameters_file"),
         "trust_option": trust_option(preferred["name"]),
         "reproduction": {
-            "command": command_of(group.problem.request, logs, models, result.request_words),
+            "command": command_of(
+                group.problem.request, logs, [*result.models.values()], result.request_words
+            ),
             "folder": str(Path.cwd()),
             "logs": fingerprints(logs),
         },

@@ -344,10 +344,11 @@ def _frequency(subject: Subject) -> Iterator[Picture]:
         yield Picture(
             _stem("bode", output.name), "frequency",
             f"Frequency response from {given.name} to {output.name}, estimated from "
-            f"{estimate.n_segments} segments of the logs.{lacking}",
+            f"{estimate.n_segments} segments of the logs. Left out are frequencies at which the "
+            f"input has no power or the coherence may be that of noise.{lacking}",
             bode(
                 estimate.frequency, estimate.response[:, 0, i], estimate.coherence[:, 0, i],
-                estimate.deviation[:, 0, i] / np.sqrt(2.0),
+                estimate.deviation[:, 0, i] / np.sqrt(2.0), estimate.significant[:, 0, i],
                 None if identified is None else identified.response[:, 0, i],
                 band[inside],
                 {name: response[inside, j, i] for name, response in linear.items()},
@@ -368,7 +369,8 @@ def _response_of(records: Sequence[Dataset], output: int) -> FrequencyResponse |
 
 def _cause(measured: FrequencyResponse) -> int | None:
     """The input that is most coherent with an output, if any is coherent enough."""
-    n_coherent = np.sum(measured.coherence[:, 0] > _COHERENT, axis=0)
+    coherent = (measured.coherence[:, 0] > _COHERENT) & measured.significant[:, 0]
+    n_coherent = np.sum(coherent, axis=0)
     cause = int(np.argmax(n_coherent))
     return cause if n_coherent[cause] >= _FEWEST_COHERENT else None
 

@@ -20,6 +20,9 @@ _PARTS = 3.0  # segments without overlap that a record should hold at least
 _GROWTH = 10.0
 # Independent segments that one half-overlapping Hann segment is worth (Welch 1967).
 _WORTH = 0.95
+_FALSE = 0.05  # share of the significant frequencies that may be noise alone
+# Of an input's largest density; what a Hann window leaks from there is more than what is below.
+_FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -29,15 +32,18 @@ class FrequencyResponse:
     frequency: (n,), Hz, above 0. response: (n, n_outputs, n_inputs). coherence: the same shape,
     partial coherence of output and input, what the other inputs explain taken away; of a single
     input the ordinary one. deviation: the same shape, standard deviation of the response (as of a
-    complex number, so of its magnitude that over root 2). input_density: (n, n_inputs), power
-    spectral density, unit squared per Hz, one-sided. varied: (n_inputs,), inputs that change; the
-    columns of the others are NaN. n_segments: how many were averaged.
+    complex number, so of its magnitude that over root 2). significant: the same shape, where the
+    input has power and the coherence is more than noise alone gives, which 5 % of these points may
+    be by chance. input_density: (n, n_inputs), power spectral density, unit squared per Hz,
+    one-sided. varied: (n_inputs,), inputs that change; the columns of the others are NaN.
+    n_segments: how many were averaged.
     """
 
     frequency: FloatArray
     response: ComplexArray
     coherence: FloatArray
     deviation: FloatArray
+    significant: BoolArray
     input_density: FloatArray
     varied: BoolArray
     n_segments: int
@@ -154,15 +160,34 @@ def _estimate(
         coherence = np.where(power + spread > 0.0, power / (power + spread), 0.0)
     # Each fitted input takes a degree of freedom of the noise.
     left = max(_WORTH * k - u.shape[2], 1.0)
+    density = 2.0 * dt / length * np.mean(np.abs(inputs) ** 2, axis=0)
+    among = _among(coherence, varied).real
     return FrequencyResponse(
         frequency=np.arange(1, n + 1) / (length * dt),
         response=_among(response, varied),
-        coherence=_among(coherence, varied).real,
+        coherence=among,
         deviation=_among(np.sqrt(spread / left), varied).real,
-        input_density=2.0 * dt / length * np.mean(np.abs(inputs) ** 2, axis=0),
+        significant=_significant(among, left, density),
+        input_density=density,
         varied=varied,
         n_segments=k,
     )
+
+
+def _significant(coherence: FloatArray, left: float, density: FloatArray) -> BoolArray:
+    """Where a coherence (n, n_outputs, n_inputs) is not that of noise, and the input has power.
+
+    Without a response it exceeds c with probability (1 - c)^left, left being the independent
+    segments less the inputs: Carter, Proc. IEEE 75 (1987) 236; Bendat & Piersol, "Random Data",
+    9.2. Its bound, 1 - alpha^(1/left), is at the alpha by which 5 % of the points beyond it are
+    noise: Benjamini & Hochberg, J. R. Stat. Soc. B 57 (1995) 289.
+    """
+    from scipy.stats import false_discovery_control
+
+    powered = (density > _FLOOR * density.max(axis=0))[:, None, :] & np.isfinite(coherence)
+    chance = np.where(powered, (1.0 - np.nan_to_num(coherence)) ** left, 1.0)
+    significant: BoolArray = false_discovery_control(np.clip(chance, 0.0, 1.0), axis=0) < _FALSE
+    return significant
 
 
 def _among(values: npt.NDArray[np.generic], varied: BoolArray) -> ComplexArray:

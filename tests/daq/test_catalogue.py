@@ -11,10 +11,12 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from daq.catalogue.entries import RunEntry
 from daq.catalogue.index import INDEX_NAME
 from daq.catalogue.query import ordered, select
+from daq.config.metadata import Metadata
 from tests.daq.support import on_terminal, rig, write_experiment
 
 # The current follows its command by a gain and a lag: identified in a second.
@@ -145,6 +147,9 @@ def test_of_several_folders_any_is_meant(lab):
         (("ann", "--note", "tags=" + "x" * 90), "at most 80 letters"),
         (("--plot", "runs.bmp"), "figures are written as svg, pdf, png"),
         ((".",), "no run below runs"),
+        (("runs/nothere",), "runs/nothere: there is no such folder of a run"),
+        (("ann", "--untag", "nwe"), "there is no tag 'nwe'; did you mean 'new'?"),
+        (("ann", "--note", "protocol=zz"), "'protocol' means the run's own protocol"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_with_the_cure(lab, words, complaint):
@@ -163,6 +168,11 @@ def test_runs_stand_beside_each_other_in_a_table_and_in_a_figure(lab, tmp_path):
         value = next(q["value"] for q in run["quantities"] if q["name"] == "gain")
         assert f"{value:.4f}"[:5] in row
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_parameters_that_are_listed_have_their_units(lab):
+    done = rig("runs", "operator=Ann", "--parameters", "gain,tau", cwd=lab)
+    assert "gain [A/V]" in done.stdout and "tau [s]" in done.stdout
 
 
 @pytest.mark.parametrize("minutes", [4, 175])
@@ -351,6 +361,21 @@ def test_metadata_of_an_experiment_is_checked_with_it(tmp_path):
     assert result.returncode == 2
     assert "metadata.operator" in result.stderr
     assert "metadata.tags" in result.stderr
+
+
+@pytest.mark.parametrize("key", [*RunEntry("a").described, "tag", "run"])
+def test_what_a_run_is_known_by_is_no_key_to_note_under(key):
+    with pytest.raises(ValidationError, match=f"'{key}' means the run's own"):
+        Metadata.model_validate({key: "zz"})
+
+
+def test_facts_are_refused_in_an_experiment_and_when_it_is_run(tmp_path):
+    write_experiment(tmp_path / "bad.yaml", metadata={"status": "fine"})
+    write_experiment(tmp_path / "good.yaml")
+    for words in (("check", "bad.yaml"), ("run", "good.yaml", "--note", "protocol=zz")):
+        result = rig(*words, cwd=tmp_path)
+        assert result.returncode == 2 and "choose another key" in result.stderr
+    assert not (tmp_path / "runs").exists()
 
 
 _DATES = st.datetimes(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import numpy as np
 import pandas as pd
@@ -43,7 +44,7 @@ class Spring(ClosedLoop):
         series = Series("measured", samples.time, samples.theta)
         error = float(np.mean(samples.theta - extra["theta_ref"]))
         return Findings(
-            (Number("error", error, "rad"),), (table,),
+            (Number("error", error, "rad"), Number("stiffest", 12.0, "N*m/rad")), (table,),
             (Chart("angle", "Angle", Axis("time", "s"), Axis("angle", "rad"), (series,)),),
             {"K_m": (0.1, 0.2)},
         )
@@ -141,6 +142,7 @@ def test_what_the_protocol_concludes_is_written_and_shown(run, tmp_path):
     assert again.returncode == 0, again.stderr
     assert json.loads(again.stdout) == document["findings"]
     printed = rig("analyse", folder, "--trust", cwd=tmp_path).stdout
+    assert re.search(r"stiffest +12 +- ", printed), "no digits that it does not have"
     rig_file = record_of(tmp_path / folder)["rig_file"]
     assert f"Next: rig run prbs.yaml --rig {rig_file} --identify --config " in printed
 

@@ -91,13 +91,24 @@ def test_what_cannot_be_exported_is_a_mistake_that_leaves_nothing(tmp_path, kind
     assert [file.name for file in tmp_path.iterdir()] == ["log.csv"]
 
 
-def test_columns_that_no_run_has_are_not_exported_and_no_wrong_option_is_named(
-    tmp_path,
-):
-    (tmp_path / "belt.csv").write_text("Zeit [ms];Weg [mm]\n0,0;1,5\n1,0;1,6\n")
+@pytest.mark.parametrize("head", ["Zeit [ms];Weg [mm]", "t;omega"])
+def test_columns_of_no_run_are_not_exported_and_no_wrong_option_is_named(tmp_path, head):
+    (tmp_path / "belt.csv").write_text(f"{head}\n0,0;1,5\n1,0;1,6\n")
     done = rig("export", "parquet", "belt.csv", cwd=tmp_path)
-    assert done.returncode == 2 and "it has Zeit [ms], Weg [mm]" in done.stderr
-    assert "--config" not in done.stderr
+    assert done.returncode == 2 and f"it has {head.replace(';', ', ')}" in done.stderr
+    assert "--config" not in done.stderr and "rig identify" in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["mat", "mcap", "parquet", "fmu"])
+@pytest.mark.parametrize(
+    ("out", "cure"), [("a.csv", "name it a."), ("nodir/a", "there is no folder nodir, make it")]
+)
+def test_a_file_of_another_format_or_without_a_folder_is_not_written(
+    tmp_path, capture, kind, out, cure
+):
+    done = rig("export", kind, str(capture), "--out", out, cwd=tmp_path)
+    assert done.returncode == 2 and cure in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_log_of_another_program_is_exported_without_a_record(tmp_path):

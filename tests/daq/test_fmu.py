@@ -1,6 +1,7 @@
 """Identified models as functional mock-up units, opened by FMPy."""
 
 import ctypes
+import datetime
 import json
 import shutil
 import subprocess
@@ -157,6 +158,15 @@ def test_the_command_writes_a_result_with_its_source_and_record(tmp_path):
     assert bool(written["binaries"]) == COMPILES == any(n.startswith("binaries/") for n in names)
     with pytest.raises(ConfigError, match="trust"):
         export(tmp_path)
+
+
+def test_the_description_says_when_it_was_made_in_universal_time(tmp_path):
+    noon = datetime.datetime(2026, 3, 1, 12, tzinfo=datetime.timezone(datetime.timedelta(hours=2)))
+    unit = unit_of(lag(), lag().nominal, compiler=None, generated=noon)
+    description = fmpy.read_model_description(str(unit.save(tmp_path / "lag.fmu")))
+    assert description.generationDateAndTime == "2026-03-01T10:00:00Z"
+    now = unit_of(lag(), lag().nominal, compiler=None).description
+    assert f'generationDateAndTime="{datetime.datetime.now(datetime.UTC):%Y-%m-%d}' in now
 
 
 def test_units_are_whole_powers_of_base_units():

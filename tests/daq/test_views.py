@@ -11,7 +11,7 @@ from daq import check, identify, load, record, replay, tune
 from daq.characterise.characterise import Characterisation
 from daq.characterise.rounds import Interval, Round
 from daq.identification.comparison import SeedsResult
-from daq.identification.rows import ParameterRow
+from daq.identification.rows import AmbiguityRow, ParameterRow, QuantityRow, Rows
 from daq.run.runner import RunResult
 from daq.views import Shown
 from sysid import Dataset
@@ -56,11 +56,28 @@ def test_an_identification_says_what_may_be_used_and_shows_intervals(log):
     low, high = (float(end) for end in shown["K_m"][2].split(" .. "))
     assert low < float(shown["K_m"][1]) < high and shown["K_m"][3] == "N*m/A"
     assert shown["L_m"][2:] == ["-", "mH", "fixed"]
-    parts = ("model", "estimator", "problem", "uncertainty", "training", "verdict", "suspicion")
+    parts = ("model", "estimator", "problem", "uncertainty", "training", "suspicion")
     lengths = {part: len(repr(getattr(result, part))) for part in parts}
     assert max(lengths.values()) < 700, lengths
+    assert len(repr(result.rows)) < 100 and len(repr(result.verdict)) < 100
+    assert table_of(result.rows) == table_of(result)
+    assert {row[2] for row in table_of(result.verdict)[1:]} >= set(result.reasons)
+    fit = result.training[0].result.metrics.fit[-1]
+    assert float(shown["fit of omega"][1]) == pytest.approx(fit, abs=0.06)
     assert repr(result.training[0].result).startswith("<RecordResult: ")
     assert f"{len(log.frame)} samples" in result.training[0]._repr_html_()
+
+
+def test_combinations_stand_below_the_parameters_that_act_only_together():
+    searched = {"undetermined": "tied", "range": (1e-5, 1e-3)}
+    inertia = [ParameterRow(name, 5e-5, "kg*m^2", **searched) for name in ("J_m", "J_b")]
+    total = QuantityRow("J_m + J_b", 1.05e-4, "kg*m^2", (1.0e-4, 1.1e-4))
+    tied = AmbiguityRow("tied", ("J_m", "J_b"), (total,), ())
+    rows = Rows(tuple(inertia), (tied,), (), {}, {"training": (), "validation": ()}, refined=True)
+    assert repr(rows) == "<Rows: 0 of 2 free parameters by themselves and 1 combination of others>"
+    shown = {row[0]: row[1:] for row in table_of(rows)}
+    assert shown["J_m + J_b"] == ["1.05e-4", "1.00e-4 .. 1.10e-4", "kg*m^2", ""]
+    assert shown["J_b"][3] == "only together"
 
 
 def test_a_tied_parameter_is_not_called_fixed():

@@ -1,5 +1,8 @@
 """The gallery's systems are found from a small form of their own data."""
 
+import re
+import sys
+
 import numpy as np
 import pytest
 import yaml
@@ -29,6 +32,19 @@ def test_each_has_settings_and_a_place_in_the_table(gallery):
         assert table.count(f"`{name}`]({name}.py)") == 1 and f"`{name}.py`" in table
         lines = (GALLERY / f"{name}.py").read_text(encoding="utf-8").splitlines()
         assert len(lines) <= 60
+
+
+@pytest.mark.parametrize("name", ["actuator", "dc_motor", "friction_drive", *SYSTEMS])
+def test_each_has_a_result_in_the_table(name):
+    table = (GALLERY / "README.md").read_text(encoding="utf-8")
+    assert re.search(rf"^\| \[`{name}`\]\(.+\) \| `\w+` \| .+ \.\. ", table, re.MULTILINE)
+
+
+def test_help_makes_nothing(gallery, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["make.py", "--help"])
+    with pytest.raises(SystemExit) as end:
+        gallery("make").main()
+    assert end.value.code == 0 and "python make.py" in capsys.readouterr().out
 
 
 @pytest.mark.soak

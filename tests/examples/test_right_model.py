@@ -35,5 +35,6 @@ def test_what_is_wrong_is_told_and_its_cure_finds_the_truth(
         return
     right = identify(*files, config=FOLDER / "drive.yaml", **cure)
     assert right.verdict.parameters.trust == "good"
+    assert "nothing of the inputs is left" in right.verdict.predicted.reasons[0]
     for name in ("inertia", "viscous"):
         assert right.parameters.value[name] == pytest.approx(cases.TRUTH[name], rel=0.003)

@@ -78,6 +78,39 @@ def test_power_of_the_inputs_is_all_in_their_density():
     assert power == pytest.approx(data.inputs.var(axis=0), rel=0.03)
 
 
+def levels(n_samples, hold, rng):
+    return np.repeat(rng.uniform(-1.0, 1.0, n_samples // hold + 1), hold)[:n_samples, None]
+
+
+@pytest.mark.parametrize("n_samples", [400, 3000, 60000])
+def test_noise_alone_is_not_significant_however_few_the_segments(n_samples):
+    shares = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        record = Dataset(levels(n_samples, 20, rng), rng.normal(size=(n_samples, 1)), DT)
+        shares.append(frequency_response([record]).significant.mean())
+    assert np.mean(shares) < 0.005
+
+
+def test_a_response_is_significant_where_its_input_has_power_and_noise_does_not_hide_it():
+    rng = np.random.default_rng(1)
+    u = levels(20000, 20, rng)
+    lag = signal.lfilter([0.1], [1.0, -0.9], u, axis=0)
+    estimate = frequency_response([Dataset(u, lag + 0.01 * rng.normal(size=u.shape), DT)])
+    significant, frequency = estimate.significant[:, 0, 0], estimate.frequency
+    assert significant[frequency < 2.0].all()
+    nulls = np.isclose(frequency % 5.0, 0.0, atol=0.05)  # of levels held for 0.2 s
+    assert not significant[nulls].any()
+
+
+def test_what_a_window_leaks_of_a_tone_is_no_power():
+    time = DT * np.arange(20000)
+    u = np.sin(2.0 * np.pi * 5.0 * time)[:, None]
+    estimate = frequency_response([Dataset(u, 2.0 * u, DT)])
+    significant = estimate.frequency[estimate.significant[:, 0, 0]]
+    assert len(significant) and np.all(np.abs(significant - 5.0) < 1.0)
+
+
 def test_lost_samples_and_still_inputs_are_left_out():
     data = measured(3000, 0.0, 5)
     inputs = np.column_stack([data.inputs, np.full(3000, 2.0)])
