@@ -20,9 +20,16 @@ from sysid.experiments.experiment import (
 from sysid.experiments.feedback import Feedback
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
-from sysid.experiments.rivals import Answer, Hypothesis
+from sysid.experiments.rivals import ROUGH, Answer, Hypothesis
 from sysid.experiments.search import RunCandidate, Search
-from sysid.experiments.tournament import EVEN, AnsweredRun, Point, Tournament, power
+from sysid.experiments.tournament import (
+    EVEN,
+    AnsweredRun,
+    Point,
+    Tournament,
+    harmonic_loss,
+    power,
+)
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
@@ -30,7 +37,7 @@ from sysid.threads import Workers, available_cores, one_thread
 
 _REFITS = 3  # of all rivals, between generations of runs
 _SURE = 0.95  # power from which a pair counts as told apart
-_SHARPER = 0.1  # of the accuracy, with which the end is computed once more
+_COARSER, _COARSEST = 100.0, 0.1  # times the accuracy, and its end, while runs are searched for
 
 
 @dataclass(frozen=True)
@@ -141,7 +148,9 @@ def discriminate(
     >>> [contest.probability > 0.99 for contest in result.contests]
     [True, True]
     """
-    structures = _structures(models, noise, spaces or {}, priors or {}, accuracy)
+    # Runs are searched for by coarser simulations.
+    coarse = min(_COARSER * accuracy, _COARSEST)
+    structures = _structures(models, noise, spaces or {}, priors or {}, coarse)
     rng, workers = np.random.default_rng(seed), Workers(available_cores())
     benches = benches or _free_runs(structures, limits or {}, margin)
     knowledge = [
@@ -151,8 +160,7 @@ def discriminate(
         each.space.full(prior.draws(each.space, checks, rng))
         for each, prior in zip(structures, knowledge, strict=True)
     ]
-    counted = np.array([name in noise for name in structures[0].simulator.model.output_names])
-    tournament = Tournament(structures, counted, workers, rng)
+    tournament = Tournament(structures, workers, rng)
 
     def logged(inputs: FloatArray | Feedback, dt: float, n: int) -> list[Dataset] | None:
         records = []
@@ -177,30 +185,32 @@ def discriminate(
     confirm = partial(kept_by_all, lambda inputs, dt: logged(inputs, dt, checks))
     search = Search(excitations, evaluate, aim, rng, runs, workers, watch, confirm)
     search.scatter(candidates)
-    begins = tournament.begins(tournament.likeliest(), starts)
-    tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins)[0])
+    begins = tournament.begins(tournament.likeliest(), 1)
+    tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins, ROUGH)[0])
     search.revise(tournament.judged)
     tournament.judge_possible(search.pool, runs)
-    best: tuple[float, list[RunCandidate], Point] = (-1.0, [], [])
+    best: tuple[float, list[RunCandidate], Point] = (np.inf, [], [])
     for part in np.array_split(np.arange(generations), _REFITS):
-        search.aim = tournament.criterion()
+        search.aim = aim = tournament.criterion()
         search.choose()
         for k in part:
             search.generation(offspring, k / max(generations - 1, 1))
             search.choose()
         chosen = [search.pool[i] for i in search.chosen]
-        point, distances = tournament.refit(_answers(chosen), tournament.points[-1:])
+        foreseen = aim.distances(search.total()[None])[0]
+        latest = tournament.points[-1:]
+        point, distances = tournament.refit(_answers(chosen), latest, ROUGH, foreseen)
         tournament.possible = tournament.possible | (power(distances) > EVEN)
-        worst = float(distances[tournament.possible].min())
-        best = max(best, (worst, chosen, point), key=lambda each: each[0])
+        loss = harmonic_loss(distances[tournament.possible])
+        best = min(best, (loss, chosen, point), key=lambda each: each[0])
         tournament.points.append(point)
         search.revise(tournament.judged)
     answers = _answers(best[1])
     begins = tournament.begins(best[2], starts)
-    sharp = tournament.sharper(_SHARPER * accuracy)
+    point, _ = tournament.refit(answers, begins)
+    sharp = tournament.sharper(accuracy)
     sharper = [sharp.answers([a.record for a in run]) for run in answers]
-    end = sharp.refit(sharper, [tournament.refit(answers, begins)[0]])
-    contests = _contests(sharp, tournament.possible, *end)
+    contests = _contests(sharp, tournament.possible, *sharp.refit(sharper, [point]))
     runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
     return Discrimination(
         runs_of_it, contests, attempts=search.attempts, refused=search.attempts - search.kept

@@ -18,15 +18,18 @@ import numpy as np
 from scipy.linalg import pinvh
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.engine.intervals import Intervals
 from sysid.engine.scheme import LANES
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.disturbance import with_disturbances
+from sysid.experiments.whitening import Whitener
 from sysid.identifiability import null_directions
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
 # Share of the largest information above which a direction that tells nothing is told something.
 _PHANTOM = 1e-10
+_FEWER = 3  # times the integration steps there are of what noise does
 _BURST = 1e3  # times its span, by which no output moves over the range of a parameter
 # Share of the largest scatter, of coordinates of like scatter, below which a direction has none.
 _LEAST, _TINY = 1e-9, 1e-300
@@ -92,11 +95,17 @@ class Informant:
         slopes = self._slopes(record, chromosome[None], n_free, unknown, 0, n_steps)
         return np.asarray(slopes[0])
 
-    def pushes(self, record: Dataset, chromosome: FloatArray) -> FloatArray:
-        """What draws of the inputs' noise do to the outputs, (n_samples, n_outputs, n_draws)."""
-        if not len(self._noisy):
-            return np.zeros((*record.outputs.shape, 0))
-        return np.asarray(self._slopes(record, chromosome[None], 0, (), LANES)[0])
+    def whitener(
+        self, record: Dataset, vector: FloatArray, outputs: FloatArray, n_steps: int
+    ) -> Whitener:
+        """Of the errors of a record that parameters (n_parameters,) are right of.
+
+        outputs: (n_samples, n_outputs), what they say; n_steps: of the integration.
+        """
+        model, variances = self._simulator.model, self.variances(record, outputs[None])[0]
+        intervals = Intervals(model, vector, record.inputs, record.dt, -(-n_steps // _FEWER))
+        states = intervals.run(record.initial_state(model))
+        return Whitener.along(intervals, states, variances, self._input_noise)
 
     def _unknown(self, record: Dataset) -> list[int]:
         """Places of the states whose start a record does not tell."""
