@@ -125,13 +125,10 @@ def separated(
 
     def fit(task: tuple[int, int, list[Answer], FloatArray, FloatArray]) -> None:
         i, j, answers, *starts = task
-        rival, left = hypotheses[j], []
-        for begin in (rival.values, *starts):
-            end = rivals.refit(answers, rival, begin)
-            joints = [rivals.contrast(each, rival, end).joint for each in answers]
-            left.append(sum(joint[-1, -1] for joint in joints))
+        rival = hypotheses[j]
+        _, left = rivals.refit(answers, rival, rival.values, *starts)
         n = sum(each.outputs.size for each in answers)
-        scores[i, j] = float(min(left)) + len(rival.values) * float(np.log(n))
+        scores[i, j] = left + len(rival.values) * float(np.log(n))
 
     Workers(available_cores()).each(fit, tasks)
     names = [each.name for each in hypotheses]
@@ -165,7 +162,7 @@ def noisy(
             return None
         (record,) = records
         steps = int(truth.simulator.steps_of_each(truth.space.full(hidden[None]), record)[0])
-        answer = rivals.answer(there, record, steps, np.isfinite(noise))
+        answer = rivals.answer(there, record, steps)
         outputs = answer.outputs + noise * rng.standard_normal(answer.outputs.shape)
         inputs = record.inputs + of_inputs * rng.standard_normal(record.inputs.shape)
         answers.append(replace(answer, outputs=outputs, record=replace(record, inputs=inputs)))

@@ -20,14 +20,16 @@ from sysid.experiments.experiment import (
 from sysid.experiments.feedback import Feedback
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
-from sysid.experiments.rivals import ROUGH, Answer, Hypothesis
+from sysid.experiments.rivals import FULL, ROUGH, Answer, Hypothesis
 from sysid.experiments.search import RunCandidate, Search
 from sysid.experiments.tournament import (
+    CLEAR,
     EVEN,
+    SURE,
     AnsweredRun,
     Point,
     Tournament,
-    harmonic_loss,
+    shortfall,
     power,
 )
 from sysid.problem.data import Dataset
@@ -35,7 +37,7 @@ from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
 from sysid.threads import Workers, available_cores, one_thread
 
-_REFITS = 3  # of all rivals, between generations of runs
+_REFITS = 2  # of all rivals, between generations of runs
 _SURE = 0.95  # power from which a pair counts as told apart
 _COARSER, _COARSEST = 100.0, 0.1  # times the accuracy, and its end, while runs are searched for
 
@@ -111,7 +113,7 @@ def discriminate(
     candidates: int = 64,
     generations: int = 6,
     offspring: int = 16,
-    starts: int = 3,
+    starts: int = 2,
     accuracy: float = 1e-3,
     seed: int = 0,
     watch: Callable[[int, int], None] | None = None,
@@ -186,11 +188,13 @@ def discriminate(
     search = Search(excitations, evaluate, aim, rng, runs, workers, watch, confirm)
     search.scatter(candidates)
     begins = tournament.begins(tournament.likeliest(), 1)
-    tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins, ROUGH)[0])
+    few = _answers(search.pool[: -(-runs // 2)])
+    tournament.points.append(tournament.refit(few, begins, ROUGH)[0])
     search.revise(tournament.judged)
     tournament.judge_possible(search.pool, runs)
     best: tuple[float, list[RunCandidate], Point] = (np.inf, [], [])
     for part in np.array_split(np.arange(generations), _REFITS):
+        search.revise(tournament.judged)
         search.aim = aim = tournament.criterion()
         search.choose()
         for k in part:
@@ -199,18 +203,19 @@ def discriminate(
         chosen = [search.pool[i] for i in search.chosen]
         foreseen = aim.distances(search.total()[None])[0]
         latest = tournament.points[-1:]
-        point, distances = tournament.refit(_answers(chosen), latest, ROUGH, foreseen)
+        point, distances = tournament.refit(_answers(chosen), latest, ROUGH, foreseen, CLEAR)
         tournament.possible = tournament.possible | (power(distances) > EVEN)
-        loss = harmonic_loss(distances[tournament.possible])
+        loss = float(shortfall(distances[tournament.possible]))
         best = min(best, (loss, chosen, point), key=lambda each: each[0])
         tournament.points.append(point)
-        search.revise(tournament.judged)
     answers = _answers(best[1])
-    begins = tournament.begins(best[2], starts)
-    point, _ = tournament.refit(answers, begins)
+    point, distances = tournament.refit(answers, tournament.begins(best[2], starts), ROUGH)
+    # What is sure needs no more than that; the others go to their ends, and by finer steps.
+    point, distances = tournament.refit(answers, [point], FULL, distances, SURE)
     sharp = tournament.sharper(accuracy)
     sharper = [sharp.answers([a.record for a in run]) for run in answers]
-    contests = _contests(sharp, tournament.possible, *sharp.refit(sharper, [point]))
+    end = sharp.refit(sharper, [point], FULL, distances, SURE)
+    contests = _contests(sharp, tournament.possible, *end)
     runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
     return Discrimination(
         runs_of_it, contests, attempts=search.attempts, refused=search.attempts - search.kept

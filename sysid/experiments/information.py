@@ -105,7 +105,26 @@ class Informant:
         model, variances = self._simulator.model, self.variances(record, outputs[None])[0]
         intervals = Intervals(model, vector, record.inputs, record.dt, -(-n_steps // _FEWER))
         states = intervals.run(record.initial_state(model))
-        return Whitener.along(intervals, states, variances, self._input_noise)
+        whitener = Whitener.along(intervals, states, variances, self._input_noise)
+        if not len(self._noisy):
+            return whitener
+        vectors = np.hstack([np.tile(vector, (LANES, 1)), np.eye(LANES)])
+        moved = self._disturbed.trajectories(vectors, self._with_errors(record, LANES), n_steps)
+        moved += np.sqrt(variances) * np.random.default_rng(0).standard_normal(moved.shape)
+        return whitener.loosened((moved - outputs).reshape(LANES, -1).T)
+
+    def _with_errors(self, record: Dataset, count: int, seed: int = 0) -> Dataset:
+        """A record with channels for so many draws of each measured input's noise."""
+        places = self._noisy if count else self._noisy[:0]
+        shape = record.n_samples, len(places), count
+        errors = np.random.default_rng(seed).standard_normal(shape)
+        channels = (errors * self._input_noise[places, None]).reshape(record.n_samples, -1)
+        return replace(
+            record,
+            inputs=np.hstack([record.inputs, channels]),
+            input_zero=np.zeros(0),
+            input_noise=np.zeros(0),
+        )
 
     def _unknown(self, record: Dataset) -> list[int]:
         """Places of the states whose start a record does not tell."""
@@ -141,18 +160,12 @@ class Informant:
             steps = self._simulator.steps_of_each(vectors, record)[:, None]
         else:
             steps = np.full((n, 1), n_steps)
-        places = self._noisy if n_draws else self._noisy[:0]
-        shape = record.n_samples, len(places), n_channels
-        errors = np.random.default_rng(seed).standard_normal(shape)
-        channels = (errors * self._input_noise[places, None]).reshape(record.n_samples, -1)
-        with_errors = replace(
-            record,
-            inputs=np.hstack([record.inputs, channels]),
-            input_zero=np.zeros(0),
-            input_noise=np.zeros(0),
-        )
         (slopes,) = simulator.tangents(
-            np.hstack([vectors, quiet]), [with_errors], along, steps, start_directions=[moved]
+            np.hstack([vectors, quiet]),
+            [self._with_errors(record, n_channels, seed)],
+            along,
+            steps,
+            start_directions=[moved],
         )
         return slopes
 

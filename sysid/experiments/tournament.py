@@ -18,8 +18,11 @@ from sysid.threads import Workers
 LEVEL = 0.01  # of the test by which a rival is refused
 EVEN = 0.5  # power below which a pair counts as not told apart
 _ATTEMPTS = 200  # draws for one that keeps a model's constraints
-_EVEN_DISTANCE = 5.4  # noncentrality at which it is even
-_CLEAR = 1000.0  # noncentrality that no refit to other runs will make small
+_MARGIN = 4.0  # of noncentralities, for other parameters: of half the difference
+_SECOND = 1e-3  # what counts where all is sure, so that of equal sets one is the best
+_LEAST = 1e-9  # noncentrality that counts as none
+# Noncentralities of which a refit to other runs will not make little, or one that goes further.
+CLEAR, SURE = 1000.0, 100.0
 
 Point = Sequence[FloatArray]
 """For each pair the rival's chromosome, (n_free,)."""
@@ -38,19 +41,24 @@ def power(noncentrality: FloatArray | float, level: float = LEVEL) -> FloatArray
     return np.asarray(ndtr(distance + ndtri(level)), dtype=np.float64)
 
 
-def harmonic_loss(distances: FloatArray) -> FloatArray:
-    """Of noncentralities (..., n_pairs), (...): least where their harmonic mean is largest."""
-    losses: FloatArray = np.log(np.mean(1.0 / (distances + _EVEN_DISTANCE), axis=-1))
-    return losses
+def shortfall(distances: FloatArray) -> FloatArray:
+    """How far rivals at noncentralities (..., n_pairs) are from being refused, (...).
+
+    The mean logarithm of the probabilities, of a fraction of the distances: parameters may be
+    others than those that a design starts from. A pair that hardly any run tells apart gains little
+    by twice as much of hardly anything, and does not hold others back, as in the least of all.
+    """
+    logarithms = np.log(power(distances / _MARGIN))
+    beyond = np.log(np.maximum(distances, _LEAST))
+    return np.asarray(-np.mean(logarithms + _SECOND * beyond, axis=-1))
 
 
 @dataclass(frozen=True)
 class Separation:
-    """A loss of what rivals leave: the harmonic mean over pairs, in which the least ones count.
+    """A loss of what rivals leave: the ``shortfall`` of pairs, in which the least ones count.
 
     ridges: (n_points * n_pairs, n, n). possible: (n_pairs,), the pairs that count. Each pair is as
-    far apart as at the worst of the points at which its rival was tried. A pair that hardly any run
-    tells apart gains little by a larger share of hardly anything, and does not hold others back.
+    far apart as at the worst of the points at which its rival was tried.
     """
 
     ridges: FloatArray
@@ -64,7 +72,7 @@ class Separation:
 
     def losses(self, information: FloatArray) -> FloatArray:
         """Of sums of runs' M, (n,)."""
-        return harmonic_loss(self.distances(information)[:, self.possible])
+        return shortfall(self.distances(information)[:, self.possible])
 
     def met(self, _information: FloatArray) -> bool:
         """Never: more runs tell more."""
@@ -168,11 +176,12 @@ class Tournament:
         begins: Sequence[Point],
         effort: Effort = FULL,
         distances: FloatArray | None = None,
+        below: float = np.inf,
     ) -> tuple[Point, FloatArray]:
         """Fit rivals to runs from several points: where they end, noncentralities (n_pairs,).
 
-        runs: what each structure says of each. distances: (n_pairs,), where these are clear rivals
-        stay at the first of the points; None: all are fitted.
+        runs: what each structure says of each. Where distances (n_pairs,) are not below a level
+        they are taken as they are, and rivals stay at the first of the points.
         """
         point = list(begins[0])
         left = np.zeros(len(point)) if distances is None else distances.copy()
@@ -182,7 +191,7 @@ class Tournament:
             answers = [each[i] for each in runs]
             point[c], left[c] = rivals.refit(answers, self.structures[j], *starts, effort=effort)
 
-        self._workers.each(fit, np.flatnonzero(left < _CLEAR).tolist())
+        self._workers.each(fit, np.flatnonzero(left < below).tolist())
         return point, left
 
     def judge_possible(self, pool: Sequence[RunCandidate], most: int) -> None:

@@ -7,16 +7,18 @@ sum of squares. A speed whose torque is measured is foretold from sample to samp
 wanders by more than what a small part of the model does, its changes do not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 from numba import njit
+from scipy.ndimage import uniform_filter1d
 
 from sysid.arrays import FloatArray
 from sysid.engine.intervals import Intervals, IntervalSlopes
-from sysid.engine.linear_response import feedthrough, output_slopes
+from sysid.engine.linear_response import LinearResponse, feedthrough, output_slopes
 
+_NEAR = 16  # samples whose errors are alike
 _LEAST = 1e-12  # variance of an error; a smaller one is that of rounding
 
 
@@ -24,15 +26,11 @@ _LEAST = 1e-12  # variance of an error; a smaller one is that of rounding
 class Whitener:
     """A linear filter of a run's errors.
 
-    Of m deviations, those of the states first, behind them the inputs' noise: rows, gains:
-    (n_samples, n_outputs, m), onward: (n_samples, m, m), to the next sample. deviations:
-    (n_samples, n_outputs), of what is not foretold; infinite where an output does not count.
+    response: of the filter's innovations, divided by their deviations. Its deviations are those of
+    the states, behind them the inputs' noise. An output that does not count is kept by zero.
     """
 
-    rows: FloatArray
-    gains: FloatArray
-    onward: FloatArray
-    deviations: FloatArray
+    response: LinearResponse
 
     @classmethod
     def along(
@@ -54,30 +52,39 @@ class Whitener:
         rows, onward = np.zeros((n, variances.shape[1], m)), np.zeros((n, m, m))
         rows[..., :n_states] = output_slopes(model, states, inputs, vector)
         rows[..., n_states:] = feedthrough(model, states, inputs, vector)[..., noisy]
-        slopes, ends = IntervalSlopes(intervals, states), np.zeros((n, len(noisy), m))
+        slopes, scatter = IntervalSlopes(intervals, states), np.zeros((n, len(noisy), m))
         onward[:-1, :n_states, :n_states] = slopes.by_states
         for k, j in enumerate(noisy.tolist()):
-            begin, end = slopes.by_input(j)
-            onward[:-1, n_states + k, :n_states] = begin
-            ends[1:, k, :n_states] = end
-            ends[:, k, n_states + k] = 1.0
-        scatter = ends * input_noise[noisy, None]
+            onward[:-1, n_states + k, :n_states], scatter[1:, k, :n_states] = slopes.by_input(j)
+            scatter[:, k, n_states + k] = 1.0
+        scatter *= input_noise[noisy, None]
         gains, left = _foretold(rows, onward, scatter, np.maximum(variances, _LEAST))
-        return cls(rows, gains, onward, np.sqrt(left))
+        return cls(LinearResponse(rows, gains, onward, 1.0 / np.sqrt(left), states, slopes))
 
     @property
     def finite(self) -> bool:
         """Whether the run that it goes along stays finite."""
-        return bool(np.isfinite(self.gains).all() and np.isfinite(self.onward).all())
+        parts = (self.response.gains, self.response.onward, self.response.kept)
+        return all(bool(np.isfinite(part).all()) for part in parts)
+
+    def loosened(self, errors: FloatArray) -> Self:
+        """The same with larger deviations where errors of runs that are right need them.
+
+        errors: (n_samples * n_outputs, n_draws). Where states bend within what noise moves them,
+        as those of a shaft that comes to rest, errors are not in proportion to the noise.
+        """
+        kept = self.response.kept
+        squares = np.mean(self.of(errors) ** 2, axis=1).reshape(kept.shape)
+        squares = uniform_filter1d(squares, _NEAR, axis=0, mode="nearest")
+        kept = kept / np.sqrt(np.maximum(squares, 1.0))
+        return replace(self, response=replace(self.response, kept=kept))
 
     def of(self, columns: FloatArray) -> FloatArray:
         """What is not foretold of errors, (n_samples * n_outputs, n), in its deviations."""
-        n, q = self.deviations.shape
-        counted = np.isfinite(self.deviations)[..., None]
-        errors = np.where(counted, columns.reshape(n, q, -1), 0.0)
-        left = _filtered(self.rows, self.gains, self.onward, errors)
-        whitened: FloatArray = (left / self.deviations[..., None]).reshape(columns.shape)
-        return whitened
+        shape = self.response.kept.shape
+        errors = np.where(self.response.kept[..., None] > 0.0, columns.reshape(*shape, -1), 0.0)
+        left = [self.response.of(outputs=each) for each in np.moveaxis(errors, -1, 0)]
+        return np.stack(left, axis=-1).reshape(columns.shape)
 
 
 @njit(cache=True, nogil=True)
@@ -90,67 +97,38 @@ def _foretold(
     until then.
     """
     n, q, m = rows.shape
-    n_noises = scatter.shape[1]
-    gains, left = np.zeros((n, q, m)), np.empty((n, q))
-    P, moved, shared = np.zeros((m, m)), np.empty((m, m)), np.empty(m)
+    gains, left = np.zeros((n, q, m)), variances.copy()
+    P, work = np.zeros((m, m)), np.empty((m, m))
     for k in range(n):
-        for i in range(n_noises):
-            for a in range(m):
-                for b in range(m):
-                    P[a, b] += scatter[k, i, a] * scatter[k, i, b]
+        for i in range(scatter.shape[1]):
+            _add_square(P, scatter[k, i], 1.0)
         for j in range(q):
-            left[k, j] = variances[k, j]
+            shared = gains[k, j]
+            _multiply(P, rows[k, j], shared)
             for a in range(m):
-                shared[a] = 0.0
-                for b in range(m):
-                    shared[a] += P[a, b] * rows[k, j, b]
                 left[k, j] += rows[k, j, a] * shared[a]
+            _add_square(P, shared, -1.0 / left[k, j])
             for a in range(m):
-                gains[k, j, a] = shared[a] / left[k, j]
-            for a in range(m):
-                for b in range(m):
-                    P[a, b] -= gains[k, j, a] * shared[b]
+                shared[a] /= left[k, j]
         for a in range(m):
-            for b in range(m):
-                moved[a, b] = 0.0
-                for c in range(m):
-                    moved[a, b] += onward[k, c, a] * P[c, b]
+            _multiply(P, onward[k, :, a], work[a])
         for a in range(m):
-            for b in range(m):
-                P[a, b] = 0.0
-                for c in range(m):
-                    P[a, b] += moved[a, c] * onward[k, c, b]
+            _multiply(work, onward[k, :, a], P[a])
     return gains, left
 
 
 @njit(cache=True, nogil=True)
-def _filtered(
-    rows: FloatArray, gains: FloatArray, onward: FloatArray, errors: FloatArray
-) -> FloatArray:
-    """Of errors (n_samples, n_outputs, n) what is not foretold by those before."""
-    n, q, m = rows.shape
-    n_columns = errors.shape[2]
-    left = np.empty(errors.shape)
-    d, moved = np.zeros((m, n_columns)), np.empty((m, n_columns))
-    for k in range(n):
-        for j in range(q):
-            for c in range(n_columns):
-                left[k, j, c] = errors[k, j, c]
-            for a in range(m):
-                if rows[k, j, a] != 0.0:
-                    for c in range(n_columns):
-                        left[k, j, c] -= rows[k, j, a] * d[a, c]
-            for a in range(m):
-                if gains[k, j, a] != 0.0:
-                    for c in range(n_columns):
-                        d[a, c] += gains[k, j, a] * left[k, j, c]
-        for a in range(m):
-            for c in range(n_columns):
-                moved[a, c] = 0.0
-        for b in range(m):
-            for a in range(m):
-                if onward[k, b, a] != 0.0:
-                    for c in range(n_columns):
-                        moved[a, c] += onward[k, b, a] * d[b, c]
-        d, moved = moved, d
-    return left
+def _add_square(matrix: FloatArray, row: FloatArray, factor: float) -> None:
+    """Add factor row row' to a matrix."""
+    for a in range(len(row)):
+        for b in range(len(row)):
+            matrix[a, b] += factor * row[a] * row[b]
+
+
+@njit(cache=True, nogil=True)
+def _multiply(matrix: FloatArray, row: FloatArray, product: FloatArray) -> None:
+    """Matrix times row."""
+    for a in range(len(row)):
+        product[a] = 0.0
+        for b in range(len(row)):
+            product[a] += matrix[a, b] * row[b]
