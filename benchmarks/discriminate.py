@@ -33,6 +33,7 @@ from sysid.experiments.rivals import Answer, Hypothesis, nested
 from sysid.threads import Workers, available_cores, one_thread
 
 RATE, RUN = 800.0, 1.25  # Hz, s
+ACCURACY = 1e-2  # of rigs and fits alike, by the same steps
 STRONG = 10.0  # difference of BIC
 SPREAD = 0.6, 1.6  # of hidden values about the nominal ones
 
@@ -153,7 +154,6 @@ def noisy(
     hidden: (n_free,), its parameters.
     """
     there = replace(truth, values=hidden)
-    noise = np.array([setup.noise[name] for name in setup.problem.model.output_names])
     of_inputs = np.array([setup.noise.get(name, 0.0) for name in setup.problem.model.input_names])
     answers = []
     for each in commands:
@@ -163,7 +163,9 @@ def noisy(
         (record,) = records
         steps = int(truth.simulator.steps_of_each(truth.space.full(hidden[None]), record)[0])
         answer = rivals.answer(there, record, steps)
-        outputs = answer.outputs + noise * rng.standard_normal(answer.outputs.shape)
+        # Of a speed between edges, what their instants err by as well.
+        variances = truth.informant.variances(record, answer.outputs[None])[0]
+        outputs = answer.outputs + np.sqrt(variances) * rng.standard_normal(variances.shape)
         inputs = record.inputs + of_inputs * rng.standard_normal(record.inputs.shape)
         answers.append(replace(answer, outputs=outputs, record=replace(record, inputs=inputs)))
     return answers
@@ -180,7 +182,7 @@ def drawn(space: SearchSpace, rng: np.random.Generator) -> FloatArray:
 
 def hypothesis(name: str, setup: Setup) -> Hypothesis:
     model, space, prior = setup.problem.model, setup.space, setup.prior
-    simulator = BatchSimulator(model, threads=1)
+    simulator = BatchSimulator(model, accuracy=ACCURACY, threads=1)
     informant = Informant(simulator, space, *deviations_of(model, setup.noise))
     return Hypothesis(name, simulator, informant, space, prior.values, prior.information())
 

@@ -29,8 +29,8 @@ from sysid.experiments.tournament import (
     AnsweredRun,
     Point,
     Tournament,
-    shortfall,
     power,
+    shortfall,
 )
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
@@ -164,14 +164,18 @@ def discriminate(
     ]
     tournament = Tournament(structures, workers, rng)
 
+    refusals = dict.fromkeys(range(len(structures)), 0)
+
     def logged(inputs: FloatArray | Feedback, dt: float, n: int) -> list[Dataset] | None:
-        records = []
-        for structure, of_it in zip(structures, vectors, strict=True):
-            each = benches[structure.name].records(inputs, dt, of_it[:n])
+        records: dict[int, Dataset] = {}
+        for place in sorted(refusals, key=refusals.__getitem__, reverse=True):
+            bench = benches[structures[place].name]
+            each = bench.records(inputs, dt, vectors[place][:n])
             if each is None:
+                refusals[place] += 1  # is asked sooner, to be done with what will be refused
                 return None
-            records.append(each[0])
-        return records
+            records[place] = each[0]
+        return [records[place] for place in range(len(structures))]
 
     def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
         inputs = excitation.signal(genes)
@@ -192,7 +196,7 @@ def discriminate(
     tournament.points.append(tournament.refit(few, begins, ROUGH)[0])
     search.revise(tournament.judged)
     tournament.judge_possible(search.pool, runs)
-    best: tuple[float, list[RunCandidate], Point] = (np.inf, [], [])
+    sets: list[tuple[list[RunCandidate], Point, FloatArray]] = []
     for part in np.array_split(np.arange(generations), _REFITS):
         search.revise(tournament.judged)
         search.aim = aim = tournament.criterion()
@@ -205,18 +209,19 @@ def discriminate(
         latest = tournament.points[-1:]
         point, distances = tournament.refit(_answers(chosen), latest, ROUGH, foreseen, CLEAR)
         tournament.possible = tournament.possible | (power(distances) > EVEN)
-        loss = float(shortfall(distances[tournament.possible]))
-        best = min(best, (loss, chosen, point), key=lambda each: each[0])
         tournament.points.append(point)
-    answers = _answers(best[1])
-    point, distances = tournament.refit(answers, tournament.begins(best[2], starts), ROUGH)
+        sets.append((chosen, point, distances))
+    possible = tournament.possible
+    chosen, point, _ = min(sets, key=lambda each: float(shortfall(each[2][possible])))
+    answers = _answers(chosen)
+    point, distances = tournament.refit(answers, tournament.begins(point, starts), ROUGH)
     # What is sure needs no more than that; the others go to their ends, and by finer steps.
     point, distances = tournament.refit(answers, [point], FULL, distances, SURE)
     sharp = tournament.sharper(accuracy)
     sharper = [sharp.answers([a.record for a in run]) for run in answers]
     end = sharp.refit(sharper, [point], FULL, distances, SURE)
-    contests = _contests(sharp, tournament.possible, *end)
-    runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
+    contests = _contests(sharp, possible, *end)
+    runs_of_it = tuple(designed_run(candidate) for candidate in chosen)
     return Discrimination(
         runs_of_it, contests, attempts=search.attempts, refused=search.attempts - search.kept
     )
