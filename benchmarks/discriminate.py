@@ -26,7 +26,7 @@ from daq.designs.setup import Setup, set_up_structures
 from daq.lookup.experiments import load_experiment
 from sysid import BatchSimulator, Discrimination, Excitation, ModelError, SearchSpace, discriminate
 from sysid.arrays import FloatArray
-from sysid.experiments import rivals
+from sysid.experiments import Prior, rivals
 from sysid.experiments.experiment import deviations_of
 from sysid.experiments.information import Informant
 from sysid.experiments.rivals import Answer, Hypothesis, nested
@@ -53,7 +53,10 @@ def main() -> None:
 
 
 def figures(question: TypedSettings, seeds: int) -> dict[str, Any]:
-    setups = set_up_structures(question)
+    setups = {
+        name: replace(each, prior=within_spread(each.space))
+        for name, each in set_up_structures(question).items()
+    }
     begin = time.perf_counter()
     designed = discrimination.choose(setups)
     seconds = time.perf_counter() - begin
@@ -71,6 +74,13 @@ def figures(question: TypedSettings, seeds: int) -> dict[str, Any]:
             for name, commands in runs.items()
         },
     }
+
+
+def within_spread(space: SearchSpace) -> Prior:
+    """What is known before: hidden values are the nominal ones, to within the spread."""
+    values = Prior.of_ranges(space).values
+    low, high = (space.encode(factor * values) for factor in SPREAD)
+    return Prior(values, np.diag((high - low) ** 2 / 12.0))
 
 
 def of_fixed(setups: Mapping[str, Setup], commands: Sequence[FloatArray]) -> Discrimination | None:
@@ -117,17 +127,17 @@ def separated(
         if answers is None:
             beyond += 1
             continue
-        # From what a wide search would come to as well: the truth, and any other point.
+        # From where a wide search would come to as well: the same brake in the rival's terms.
         tasks += [
-            (i, j, answers, drawn(each.space, rng), nested(each, truth.space.names, hidden))
+            (i, j, answers, nested(each, *in_terms_of(each, truth.space.names, hidden)))
             for j, each in enumerate(hypotheses)
         ]
     scores: dict[tuple[int, int], float] = {}
 
-    def fit(task: tuple[int, int, list[Answer], FloatArray, FloatArray]) -> None:
-        i, j, answers, *starts = task
+    def fit(task: tuple[int, int, list[Answer], FloatArray]) -> None:
+        i, j, answers, start = task
         rival = hypotheses[j]
-        _, left = rivals.refit(answers, rival, rival.values, *starts)
+        _, left = rivals.refit(answers, rival, rival.values, start)
         n = sum(each.outputs.size for each in answers)
         scores[i, j] = left + len(rival.values) * float(np.log(n))
 
@@ -140,6 +150,30 @@ def separated(
         "beyond_limits": beyond,
         "differences": told,
     }
+
+
+def in_terms_of(
+    rival: Hypothesis, names: Sequence[str], hidden: FloatArray
+) -> tuple[Sequence[str], FloatArray]:
+    """A hidden rig's values by name, its brake as the rival's law has it.
+
+    All three laws slide at a torque and yield at a rate: alpha z and sigma of Dahl's, of LuGre's
+    alpha / zeta and zeta, of Bouc-Wen's alpha A / (gamma + beta) and gamma + beta.
+    """
+    values = dict(zip(names, hidden.tolist(), strict=True))
+    bouc_wen = "A" in values
+    rate = values["gamma"] + values["beta"] if bouc_wen else values.get("zeta", 0.0)
+    rate = rate or values["sigma"]
+    slides = values["A"] / rate if bouc_wen else 1.0 / values.get("zeta", 1.0)
+    law = set(rival.space.names)
+    beta = rival.values[rival.space.names.index("beta")] if "beta" in law else 0.0
+    beta = min(values.get("beta", 0.1 * beta), 0.5 * rate)
+    per = {"A": values.get("A", rate), "gamma": rate - beta, "beta": beta}
+    per |= {"sigma": rate, "zeta": rate}
+    size = rate if "zeta" in law else rate / per["A"] if "A" in law else 1.0
+    per |= {name: values[name] * slides * size for name in ("alpha0", "alpha1")}
+    values |= per
+    return list(values), np.array(list(values.values()))
 
 
 def noisy(
@@ -162,12 +196,14 @@ def noisy(
             return None
         (record,) = records
         steps = int(truth.simulator.steps_of_each(truth.space.full(hidden[None]), record)[0])
-        answer = rivals.answer(there, record, steps)
+        answer, shape = rivals.answer(there, record, steps), record.inputs.shape
+        vector, n_steps = truth.space.full(hidden[None]), answer.n_steps
+        noisy = replace(record, inputs=record.inputs + of_inputs * rng.standard_normal(shape))
+        by_inputs = truth.simulator.trajectories(vector, noisy, n_steps)[0] - answer.outputs
         # Of a speed between edges, what their instants err by as well.
         variances = truth.informant.variances(record, answer.outputs[None])[0]
-        outputs = answer.outputs + np.sqrt(variances) * rng.standard_normal(variances.shape)
-        inputs = record.inputs + of_inputs * rng.standard_normal(record.inputs.shape)
-        answers.append(replace(answer, outputs=outputs, record=replace(record, inputs=inputs)))
+        by_sensors = np.sqrt(variances) * rng.standard_normal(variances.shape)
+        answers.append(replace(answer, outputs=answer.outputs - by_inputs + by_sensors))
     return answers
 
 

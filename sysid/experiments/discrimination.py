@@ -3,10 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import takewhile
 
 import numpy as np
 
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.bench import Bench, FreeRun
 from sysid.experiments.excitation import Excitation
@@ -182,8 +183,8 @@ def discriminate(
         records = logged(inputs, excitation.dt, tried_with(inputs, 1, checks))
         if records is None:
             return None
-        answers = tournament.answers(records)
-        if not all(each.finite for each in answers):
+        answers = tuple(takewhile(lambda each: each.steady, tournament.answers(records)))
+        if len(answers) < len(records):
             return None
         return tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
 
@@ -213,14 +214,8 @@ def discriminate(
         sets.append((chosen, point, distances))
     possible = tournament.possible
     chosen, point, _ = min(sets, key=lambda each: float(shortfall(each[2][possible])))
-    answers = _answers(chosen)
-    point, distances = tournament.refit(answers, tournament.begins(point, starts), ROUGH)
-    # What is sure needs no more than that; the others go to their ends, and by finer steps.
-    point, distances = tournament.refit(answers, [point], FULL, distances, SURE)
-    sharp = tournament.sharper(accuracy)
-    sharper = [sharp.answers([a.record for a in run]) for run in answers]
-    end = sharp.refit(sharper, [point], FULL, distances, SURE)
-    contests = _contests(sharp, possible, *end)
+    begins = tournament.begins(point, starts)
+    contests = _contests(tournament, _answers(chosen), begins, accuracy)
     runs_of_it = tuple(designed_run(candidate) for candidate in chosen)
     return Discrimination(
         runs_of_it, contests, attempts=search.attempts, refused=search.attempts - search.kept
@@ -232,17 +227,28 @@ def _answers(runs: Sequence[RunCandidate]) -> list[tuple[Answer, ...]]:
 
 
 def _contests(
-    tournament: Tournament, possible: BoolArray, point: Point, distances: FloatArray
+    tournament: Tournament,
+    runs: Sequence[Sequence[Answer]],
+    begins: Sequence[Point],
+    accuracy: float,
 ) -> tuple[Contest, ...]:
-    """Every pair, its rival fitted as it is at a point."""
+    """Every pair, its rival fitted to what structures say of runs.
+
+    What is sure is left at that; rivals that come closer go to their ends, and by finer steps.
+    """
+    point, distances = tournament.refit(runs, begins, ROUGH)
+    point, distances = tournament.refit(runs, [point], FULL, distances, SURE)
+    sharp = tournament.sharper(accuracy)
+    sharper = [tuple(sharp.answers([a.record for a in run])) for run in runs]
+    point, distances = sharp.refit(sharper, [point], FULL, distances, SURE)
     contests = []
     for c, (i, j) in enumerate(tournament.pairs):
         truth, rival = tournament.structures[i], tournament.structures[j]
         probability = float(power(distances[c]))
         values = dict(zip(rival.space.names, point[c].tolist(), strict=True))
-        whether = bool(possible[c]) or probability > EVEN
+        possible = bool(tournament.possible[c]) or probability > EVEN
         contests.append(
-            Contest(truth.name, rival.name, float(distances[c]), probability, values, whether)
+            Contest(truth.name, rival.name, float(distances[c]), probability, values, possible)
         )
     return tuple(contests)
 

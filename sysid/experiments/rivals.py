@@ -26,7 +26,9 @@ from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
 _ITERATIONS = 100  # of a refit
+_ROUNDING = 1e-12  # of a curvature
 _HEAT = 4  # iterations after which the worse half of several refits is given up
+_LOOSE = 0.05  # share of samples that may err by more than noise foretells
 _DAMPING = 1e-2  # with which one begins, in parts of the curvature
 _LIGHTEST, _HEAVIEST = 1e-6, 1e4
 _DAMPINGS = 10.0 ** np.arange(-3.0, 5.0)  # that are tried at once, as many as there are lanes
@@ -96,9 +98,14 @@ class Answer:
     n_steps: int
 
     @property
-    def finite(self) -> bool:
-        """Whether its simulation did not fail."""
-        return bool(np.isfinite(self.outputs).all()) and self.whitener.finite
+    def steady(self) -> bool:
+        """Whether its simulation did not fail, and errors are nearly in proportion to noise.
+
+        Where noise decides when a shaft comes to rest what rivals leave has many minima, and a fit
+        to a log ends in any of them.
+        """
+        finite = bool(np.isfinite(self.outputs).all()) and self.whitener.finite
+        return finite and self.whitener.loose <= _LOOSE
 
 
 def answer(structure: Hypothesis, record: Dataset, n_steps: int) -> Answer:
@@ -156,7 +163,10 @@ def contrast(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> Contra
 
 def remainders(joint: FloatArray, ridge: FloatArray) -> FloatArray:
     """What refits leave, (...), of sums of M (..., n_free + 1, n_free + 1) with damping ridge."""
-    curvature, push = joint[..., :-1, :-1] + ridge, joint[..., :-1, -1]
+    n = joint.shape[-1] - 1
+    # What nothing tells apart has a curvature that rounding may make singular.
+    curvature = joint[..., :-1, :-1] * (1.0 + _ROUNDING * np.eye(n)) + ridge
+    push = joint[..., :-1, -1]
     moves = np.linalg.solve(curvature, push[..., None])[..., 0]
     left: FloatArray = joint[..., -1, -1] - np.sum(push * moves, axis=-1)
     return np.maximum(left, 0.0)

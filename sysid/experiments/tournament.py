@@ -1,6 +1,6 @@
 """All ordered pairs of structures: which of them sets of runs tell apart."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -113,14 +113,14 @@ class Tournament:
         ]
         return type(self)(finer, self._workers, self._rng)
 
-    def answers(self, records: Sequence[Dataset]) -> tuple[Answer, ...]:
+    def answers(self, records: Sequence[Dataset]) -> Iterator[Answer]:
         """What each structure says of a run; records: of it, by the structures' benches."""
         pairs = list(zip(self.structures, records, strict=True))
         n_steps = max(
             int(each.simulator.steps_of_each(each.space.full(each.values)[None], record)[0])
             for each, record in pairs
         )
-        return tuple(rivals.answer(*each, n_steps) for each in pairs)
+        return (rivals.answer(each, record, n_steps) for each, record in pairs)
 
     def judged(self, run: RunCandidate) -> AnsweredRun:
         """A run with the M of each pair at each point, points one after another."""

@@ -19,6 +19,7 @@ from sysid.engine.intervals import Intervals, IntervalSlopes
 from sysid.engine.linear_response import LinearResponse, feedthrough, output_slopes
 
 _NEAR = 16  # samples whose errors are alike
+_LOOSE = 1.5  # times what is foretold, by which samples may err
 _LEAST = 1e-12  # variance of an error; a smaller one is that of rounding
 
 
@@ -28,9 +29,11 @@ class Whitener:
 
     response: of the filter's innovations, divided by their deviations. Its deviations are those of
     the states, behind them the inputs' noise. An output that does not count is kept by zero.
+    loose: share of the samples of the worst output that err by more than is foretold.
     """
 
     response: LinearResponse
+    loose: float = 0.0
 
     @classmethod
     def along(
@@ -76,8 +79,9 @@ class Whitener:
         kept = self.response.kept
         squares = np.mean(self.of(errors) ** 2, axis=1).reshape(kept.shape)
         squares = uniform_filter1d(squares, _NEAR, axis=0, mode="nearest")
-        kept = kept / np.sqrt(np.maximum(squares, 1.0))
-        return replace(self, response=replace(self.response, kept=kept))
+        larger = np.sqrt(np.maximum(squares, 1.0))
+        loose = float(np.mean(larger > _LOOSE, axis=0).max())
+        return replace(self, response=replace(self.response, kept=kept / larger), loose=loose)
 
     def of(self, columns: FloatArray) -> FloatArray:
         """What is not foretold of errors, (n_samples * n_outputs, n), in its deviations."""
