@@ -22,7 +22,7 @@ from sysid.engine.intervals import Intervals
 from sysid.engine.scheme import LANES
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.disturbance import with_disturbances
-from sysid.experiments.whitening import Whitener
+from sysid.experiments.error_filter import ErrorFilter
 from sysid.identifiability import null_directions
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
@@ -95,9 +95,9 @@ class Informant:
         slopes = self._slopes(record, chromosome[None], n_free, unknown, 0, n_steps)
         return np.asarray(slopes[0])
 
-    def whitener(
+    def error_filter(
         self, record: Dataset, vector: FloatArray, outputs: FloatArray, n_steps: int
-    ) -> Whitener:
+    ) -> ErrorFilter:
         """Of the errors of a record that parameters (n_parameters,) are right of.
 
         outputs: (n_samples, n_outputs), what they say; n_steps: of the integration.
@@ -105,13 +105,13 @@ class Informant:
         model, variances = self._simulator.model, self.variances(record, outputs[None])[0]
         intervals = Intervals(model, vector, record.inputs, record.dt, -(-n_steps // _FEWER))
         states = intervals.run(record.initial_state(model))
-        whitener = Whitener.along(intervals, states, variances, self._input_noise)
+        error_filter = ErrorFilter.along(intervals, states, variances, self._input_noise)
         if not len(self._noisy):
-            return whitener
+            return error_filter
         vectors = np.hstack([np.tile(vector, (LANES, 1)), np.eye(LANES)])
         moved = self._disturbed.trajectories(vectors, self._with_errors(record, LANES), n_steps)
         moved += np.sqrt(variances) * np.random.default_rng(0).standard_normal(moved.shape)
-        return whitener.loosened((moved - outputs).reshape(LANES, -1).T)
+        return error_filter.loosened((moved - outputs).reshape(LANES, -1).T)
 
     def _with_errors(self, record: Dataset, count: int, seed: int = 0) -> Dataset:
         """A record with channels for so many draws of each measured input's noise."""

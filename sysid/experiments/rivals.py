@@ -2,7 +2,7 @@
 
 Structure i says that a run logs y_i. Of a rival j at coordinates x let e = y_i - y_j(x) be what is
 left, S its tangents, and V the covariance of the samples' errors, noise of measured inputs included
-(``whitening``). All that matters of a run, as long as x moves little, is
+(``error_filter``). All that matters of a run, as long as x moves little, is
 
     M = [S e]' V^-1 [S e]
 
@@ -20,8 +20,8 @@ from scipy.linalg import pinvh
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
+from sysid.experiments.error_filter import ErrorFilter
 from sysid.experiments.information import Informant, without_starts
-from sysid.experiments.whitening import Whitener
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
@@ -88,13 +88,13 @@ def nested(rival: Hypothesis, names: Sequence[str], values: FloatArray) -> Float
 class Answer:
     """What a run would log if a structure were right.
 
-    outputs: (n_samples, n_outputs). whitener: of the errors of all of them. n_steps: of the
+    outputs: (n_samples, n_outputs). error_filter: of the errors of all of them. n_steps: of the
     integration, for all structures.
     """
 
     record: Dataset
     outputs: FloatArray
-    whitener: Whitener
+    error_filter: ErrorFilter
     n_steps: int
 
     @property
@@ -104,16 +104,16 @@ class Answer:
         Where noise decides when a shaft comes to rest what rivals leave has many minima, and a fit
         to a log ends in any of them.
         """
-        finite = bool(np.isfinite(self.outputs).all()) and self.whitener.finite
-        return finite and self.whitener.loose <= _LOOSE
+        finite = bool(np.isfinite(self.outputs).all()) and self.error_filter.finite
+        return finite and self.error_filter.loose <= _LOOSE
 
 
 def answer(structure: Hypothesis, record: Dataset, n_steps: int) -> Answer:
     """What a structure says that a run of a record's inputs logs."""
     vector = structure.space.full(structure.values)
     outputs = structure.simulator.trajectories(vector[None], record, n_steps)[0]
-    whitener = structure.informant.whitener(record, vector, outputs, n_steps)
-    return Answer(record, outputs, whitener, n_steps)
+    error_filter = structure.informant.error_filter(record, vector, outputs, n_steps)
+    return Answer(record, outputs, error_filter, n_steps)
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Contrast:
         truth, starts = self.answer, self.starts
         outputs = rival.simulator.trajectories(vectors, truth.record, truth.n_steps)
         with np.errstate(over="ignore", invalid="ignore"):  # of a simulation that blows up
-            errors = truth.whitener.of((truth.outputs - outputs).reshape(len(vectors), -1).T)
+            errors = truth.error_filter.of((truth.outputs - outputs).reshape(len(vectors), -1).T)
             left: FloatArray = np.sum(errors**2, axis=0)
             if starts.shape[1]:
                 push = starts.T @ errors
@@ -153,7 +153,7 @@ def contrast(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> Contra
     errors = (truth.outputs - outputs).reshape(-1)
     beside = np.column_stack([columns[:, :n_free], errors, columns[:, n_free:]])
     with np.errstate(over="ignore", invalid="ignore"):  # of a simulation that blows up
-        beside = truth.whitener.of(beside)
+        beside = truth.error_filter.of(beside)
         joint = beside.T @ beside
     if not np.isfinite(joint).all():
         failed = np.full((n_free + 1, n_free + 1), np.inf)
@@ -179,18 +179,18 @@ def refit(
 
     From several chromosomes, of which the worse half are given up after each few iterations.
     """
-    descents = [Descent(answers, rival, start, effort) for start in starts]
-    while len(descents) > 1:
-        for descent in descents:
-            descent.advance(_HEAT)
-        descents.sort(key=lambda descent: descent.left)
-        descents = descents[: len(descents) // 2]
-    (descent,) = descents
-    descent.advance(_ITERATIONS)
-    return rival.space.decode(descent.at), descent.left
+    fits = [RivalFit(answers, rival, start, effort) for start in starts]
+    while len(fits) > 1:
+        for fit in fits:
+            fit.advance(_HEAT)
+        fits.sort(key=lambda fit: fit.left)
+        fits = fits[: len(fits) // 2]
+    (fit,) = fits
+    fit.advance(_ITERATIONS)
+    return rival.space.decode(fit.at), fit.left
 
 
-class Descent:
+class RivalFit:
     """Damped Gauss-Newton steps along exact tangents, the best of several dampings each.
 
     Marquardt, "An algorithm for least-squares estimation of nonlinear parameters" (1963). at:

@@ -197,6 +197,24 @@ def test_a_run_in_which_a_rival_fails_tells_nothing():
     assert not told_by_it[1].any()
 
 
+@pytest.mark.parametrize(("level", "steady"), [(10.0, True), (0.0, False)])
+def test_a_run_whose_states_bend_within_the_noise_is_not_steady(level, steady):
+    square_law = ProcessModel(
+        name="square_law",
+        states=(State("x", "1"),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("x", "1"),),
+        parameters=(Parameter("rate", "1/s", 5.0, 1.0, 20.0),),
+        derivative=lambda x, u, p: (p[0] * (u[0] * u[0] - x[0]),),
+    )
+    space, simulator = SearchSpace.of(square_law), BatchSimulator(square_law)
+    informant = Informant(simulator, space, np.array([1e-3]), np.array([1.0]))
+    prior = Prior.of_ranges(space)
+    truth = Hypothesis("square_law", simulator, informant, space, prior.values, prior.information())
+    inputs = level + 0.1 * np.sin(np.arange(300) * 0.1)
+    assert answer(truth, blank(square_law, inputs[:, None], DT), 2).steady == steady
+
+
 def test_one_seed_gives_one_result_whatever_the_threads(monkeypatch):
     models, few = {"square": SQUARE, "cubic": CUBIC}, {**QUICK, "candidates": 4, "generations": 1}
     several = discriminate(models, [waves()], runs=1, **few)

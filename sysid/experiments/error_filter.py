@@ -24,7 +24,7 @@ _LEAST = 1e-12  # variance of an error; a smaller one is that of rounding
 
 
 @dataclass(frozen=True, eq=False)
-class Whitener:
+class ErrorFilter:
     """A linear filter of a run's errors.
 
     response: of the filter's innovations, divided by their deviations. Its deviations are those of

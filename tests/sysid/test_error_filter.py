@@ -5,7 +5,7 @@ import pytest
 
 from sysid import Input, Output, Parameter, ProcessModel, State
 from sysid.engine.intervals import Intervals
-from sysid.experiments.whitening import Whitener
+from sysid.experiments.error_filter import ErrorFilter
 
 DT, N = 0.05, 40
 INPUT_NOISE = np.array([0.3, 0.2])
@@ -26,9 +26,9 @@ def outputs(inputs):
     return np.column_stack([states[:, 0], states[:, 1] + 0.5 * inputs[:, 1]])
 
 
-def whitener(inputs, variances):
+def error_filter(inputs, variances):
     intervals = Intervals(OSCILLATOR, VECTOR, inputs, DT, 16)
-    return Whitener.along(intervals, intervals.run(START), variances, INPUT_NOISE)
+    return ErrorFilter.along(intervals, intervals.run(START), variances, INPUT_NOISE)
 
 
 def test_it_is_a_root_of_the_inverse_of_the_errors_covariance():
@@ -40,14 +40,14 @@ def test_it_is_a_root_of_the_inverse_of_the_errors_covariance():
         further[place] += INPUT_NOISE[place[1]]
         moved.append((outputs(further) - outputs(inputs)).reshape(-1))
     covariance = np.diag(variances.reshape(-1)) + np.array(moved).T @ np.array(moved)
-    root = whitener(inputs, variances).of(np.eye(2 * N))
+    root = error_filter(inputs, variances).of(np.eye(2 * N))
     assert root.T @ root @ covariance == pytest.approx(np.eye(2 * N), abs=1e-5)
 
 
 def test_an_output_without_weight_counts_nothing():
     variances = np.full((N, 2), 1e-4)
     variances[:, 1] = np.inf
-    filtered = whitener(np.zeros((N, 2)), variances)
+    filtered = error_filter(np.zeros((N, 2)), variances)
     errors = np.random.default_rng(0).standard_normal((N, 2, 1))
     without = errors.copy()
     without[:, 1] = np.nan
@@ -57,7 +57,7 @@ def test_an_output_without_weight_counts_nothing():
 
 
 def test_what_errs_more_than_foretold_counts_less():
-    filtered = whitener(np.zeros((N, 2)), np.full((N, 2), 1e-4))
+    filtered = error_filter(np.zeros((N, 2)), np.full((N, 2), 1e-4))
     errors = 1e-2 * np.random.default_rng(0).standard_normal((N, 2, 16))
     errors[20:, 0] *= 100.0
     looser = filtered.loosened(errors.reshape(2 * N, 16))
