@@ -82,6 +82,8 @@ class Discrimination(ChosenRuns):
     >>> other = Contest("b", "a", 0.0, 0.01, {}, possible=False)
     >>> Discrimination((run,), (one, other), attempts=64, refused=3).inseparable
     ()
+    >>> Discrimination((run,), (one, other), attempts=64, refused=3).nested
+    (('b', 'a'),)
     """
 
     contests: tuple[Contest, ...]
@@ -96,6 +98,16 @@ class Discrimination(ChosenRuns):
             if frozenset((c.truth, c.rival)) not in possible
         )
         return tuple(pair for pair in pairs if pair == tuple(sorted(pair)))
+
+    @property
+    def nested(self) -> tuple[tuple[str, str], ...]:
+        """Truths with rivals that do all they do, to within the noise, and more.
+
+        Such a rival is never refused: only the other direction tells, or that it needs more.
+        """
+        apart = {frozenset((c.truth, c.rival)) for c in self.contests if c.possible}
+        pairs = [(c.truth, c.rival) for c in self.contests if not c.possible]
+        return tuple(pair for pair in pairs if frozenset(pair) in apart)
 
 
 @one_thread()

@@ -160,6 +160,7 @@ def test_the_runs_that_tell_pairs_apart_are_at_the_limits_and_beside_zero():
         assert contest.distance < 1e-3
         assert contest.values["k"] == pytest.approx(1.0, rel=1e-3)
     assert result.inseparable == ()
+    assert set(result.nested) == {("linear", "square"), ("linear", "cubic")}
     for run in result.runs:
         reach = np.abs(run.inputs).max()
         assert 1.5 < reach <= 1.8
