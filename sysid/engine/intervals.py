@@ -153,9 +153,9 @@ class IntervalSlopes:
     @cached_property
     def by_causes(self) -> FloatArray:
         """Over what acts, as of ``Intervals.causes``."""
-        return self._by_some_causes(slice(None))
+        return self._by_causes_at(slice(None))
 
-    def _by_some_causes(self, places: slice | list[int]) -> FloatArray:
+    def _by_causes_at(self, places: slice | list[int]) -> FloatArray:
         inputs = np.maximum(np.abs(self.intervals.inputs).max(axis=0, initial=0.0), _LEAST)
         # A rate counts by how far it moves a state.
         sizes = np.append(inputs, self._sizes / self.intervals.dt)
@@ -180,9 +180,9 @@ class IntervalSlopes:
         """Over input j at an interval's begin and at its end, (n_samples - 1, n_states) each."""
         changing, inputs = self.intervals.changing, self.intervals.inputs.shape[1]
         if j not in changing:
-            slopes = self._by_some_causes([j])
+            slopes = self._by_causes_at([j])
             return slopes[:, 0], np.zeros_like(slopes[:, 0])
-        slopes = self._by_some_causes([j, inputs + self.states.shape[1] + changing.index(j)])
+        slopes = self._by_causes_at([j, inputs + self.states.shape[1] + changing.index(j)])
         return slopes[:, 0], slopes[:, 1]
 
     def _slopes(self, ends: Callable[[FloatArray], FloatArray], steps: FloatArray) -> FloatArray:

@@ -12,11 +12,14 @@ from typing import Self
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from sysid.arrays import FloatArray
 from sysid.engine.intervals import Intervals, IntervalSlopes
-from sysid.engine.linear_response import LinearResponse, feedthrough, output_slopes
+from sysid.engine.linear_response import changes_along, feedthrough, output_slopes
+
+SingleArray = NDArray[np.float32]
 
 _NEAR = 16  # samples whose errors are alike
 _LOOSE = 1.5  # times what is foretold, by which samples may err
@@ -27,12 +30,17 @@ _LEAST = 1e-12  # variance of an error; a smaller one is that of rounding
 class ErrorFilter:
     """A linear filter of a run's errors.
 
-    response: of the filter's innovations, divided by their deviations. Its deviations are those of
-    the states, behind them the inputs' noise. An output that does not count is kept by zero.
-    loose: share of the samples of the worst output that err by more than is foretold.
+    As of ``LinearResponse``, whose deviations are those of the states, behind them the inputs'
+    noise: rows, gains: (n_samples, n_outputs, m), onward: (n_samples, m, m); single precision, for
+    a search keeps many. kept: (n_samples, n_outputs), one over the deviation of what is not
+    foretold, zero for an output that does not count. loose: share of the samples of the worst
+    output that err by more than is foretold.
     """
 
-    response: LinearResponse
+    rows: SingleArray
+    gains: SingleArray
+    onward: SingleArray
+    kept: FloatArray
     loose: float = 0.0
 
     @classmethod
@@ -62,13 +70,13 @@ class ErrorFilter:
             scatter[:, k, n_states + k] = 1.0
         scatter *= input_noise[noisy, None]
         gains, left = _foretold(rows, onward, scatter, np.maximum(variances, _LEAST))
-        return cls(LinearResponse(rows, gains, onward, 1.0 / np.sqrt(left), states, slopes))
+        parts = (each.astype(np.float32) for each in (rows, gains, onward))
+        return cls(*parts, 1.0 / np.sqrt(left))
 
     @property
     def finite(self) -> bool:
         """Whether the run that it goes along stays finite."""
-        parts = (self.response.gains, self.response.onward, self.response.kept)
-        return all(bool(np.isfinite(part).all()) for part in parts)
+        return all(bool(np.isfinite(p).all()) for p in (self.gains, self.onward, self.kept))
 
     def loosened(self, errors: FloatArray) -> Self:
         """The same with larger deviations where errors of runs that are right need them.
@@ -76,18 +84,22 @@ class ErrorFilter:
         errors: (n_samples * n_outputs, n_draws). Where states bend within what noise moves them,
         as those of a shaft that comes to rest, errors are not in proportion to the noise.
         """
-        kept = self.response.kept
-        squares = np.mean(self.of(errors) ** 2, axis=1).reshape(kept.shape)
+        squares = np.mean(self.of(errors) ** 2, axis=1).reshape(self.kept.shape)
         squares = uniform_filter1d(squares, _NEAR, axis=0, mode="nearest")
         larger = np.sqrt(np.maximum(squares, 1.0))
         loose = float(np.mean(larger > _LOOSE, axis=0).max())
-        return replace(self, response=replace(self.response, kept=kept / larger), loose=loose)
+        return replace(self, kept=self.kept / larger, loose=loose)
 
     def of(self, columns: FloatArray) -> FloatArray:
         """What is not foretold of errors, (n_samples * n_outputs, n), in its deviations."""
-        shape = self.response.kept.shape
-        errors = np.where(self.response.kept[..., None] > 0.0, columns.reshape(*shape, -1), 0.0)
-        left = [self.response.of(outputs=each) for each in np.moveaxis(errors, -1, 0)]
+        (n, q), m = self.kept.shape, self.rows.shape[2]
+        errors = np.where(self.kept[..., None] > 0.0, columns.reshape(n, q, -1), 0.0)
+        parts = [each.astype(np.float64) for each in (self.rows, self.gains, self.onward)]
+        nothing, first = np.zeros((n, m)), np.zeros(m)
+        left = [
+            changes_along(*parts, nothing, np.ascontiguousarray(each), first) * self.kept
+            for each in np.moveaxis(errors, -1, 0)
+        ]
         return np.stack(left, axis=-1).reshape(columns.shape)
 
 

@@ -61,7 +61,7 @@ def test_what_errs_more_than_foretold_counts_less():
     errors = 1e-2 * np.random.default_rng(0).standard_normal((N, 2, 16))
     errors[20:, 0] *= 100.0
     looser = filtered.loosened(errors.reshape(2 * N, 16))
-    larger = filtered.response.kept / looser.response.kept
+    larger = filtered.kept / looser.kept
     assert larger[:10] == pytest.approx(1.0, abs=0.2)
     assert larger[30:, 0].min() > 10.0
     left = looser.of(errors.reshape(2 * N, 16)).reshape(N, 2, 16)
