@@ -140,7 +140,7 @@ def separated(
     def fit(task: tuple[int, int, list[Answer], FloatArray]) -> None:
         i, j, answers, start = task
         rival = hypotheses[j]
-        _, left = rivals.refit(answers, rival, rival.values, start)
+        left = min(rivals.refit(answers, rival, begin)[1] for begin in (rival.values, start))
         n = sum(each.outputs.size for each in answers)
         scores[i, j] = left + len(rival.values) * float(np.log(n))
 
