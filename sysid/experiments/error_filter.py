@@ -70,8 +70,8 @@ class ErrorFilter:
             scatter[:, k, n_states + k] = 1.0
         scatter *= input_noise[noisy, None]
         gains, left = _foretold(rows, onward, scatter, np.maximum(variances, _LEAST))
-        parts = (each.astype(np.float32) for each in (rows, gains, onward))
-        return cls(*parts, 1.0 / np.sqrt(left))
+        single = [each.astype(np.float32) for each in (rows, gains, onward)]
+        return cls(single[0], single[1], single[2], 1.0 / np.sqrt(left))
 
     @property
     def finite(self) -> bool:
@@ -94,13 +94,13 @@ class ErrorFilter:
         """What is not foretold of errors, (n_samples * n_outputs, n), in its deviations."""
         (n, q), m = self.kept.shape, self.rows.shape[2]
         errors = np.where(self.kept[..., None] > 0.0, columns.reshape(n, q, -1), 0.0)
-        parts = [each.astype(np.float64) for each in (self.rows, self.gains, self.onward)]
-        nothing, first = np.zeros((n, m)), np.zeros(m)
-        left = [
-            changes_along(*parts, nothing, np.ascontiguousarray(each), first) * self.kept
-            for each in np.moveaxis(errors, -1, 0)
-        ]
-        return np.stack(left, axis=-1).reshape(columns.shape)
+        rows, gains, onward = (p.astype(np.float64) for p in (self.rows, self.gains, self.onward))
+        nothing, first, left = np.zeros((n, m)), np.zeros(m), np.empty(errors.shape)
+        for k in range(errors.shape[2]):
+            column = np.ascontiguousarray(errors[..., k])
+            left[..., k] = changes_along(rows, gains, onward, nothing, column, first)
+        whitened: FloatArray = (left * self.kept[..., None]).reshape(columns.shape)
+        return whitened
 
 
 @njit(cache=True, nogil=True)
