@@ -3,11 +3,14 @@
 python -m benchmarks.discriminate [--json] [--seeds 2] [--time 5] [--candidates 32]
     [--hysteresis bouc-wen dahl lugre] [--friction none stribeck]
 
+What is known before is that hidden values are within a factor of 0.6 to 1.6 of the nominal ones.
 For each pair the noncentrality of the refitted rival, and the probability that a test at 1 %
-refuses it, both at the models' nominal values. Then, for each seed and each structure as the truth,
-hidden parameters are drawn anew, a factor of 0.6 to 1.6 each, the runs are simulated with noise on
-all that is measured, and every structure is fitted to them: a pair is separated where the BIC of
-the rival is larger by more than 10. A truth of which a run would pass a limit is counted beside.
+refuses it, both at the nominal values. Then, for each seed and each structure as the truth, hidden
+parameters are drawn, the runs are simulated with noise of the sensors and with what noise of the
+measured torque does to the right model, and every structure is fitted to them: a pair is separated
+where the BIC of the rival is larger by more than 10. (A rival is not fitted by the noisy torque
+itself: what noise of an input does to parameters is the identification's matter.) A truth of which
+a run would pass a limit is counted beside.
 """
 
 from __future__ import annotations
@@ -26,13 +29,14 @@ from daq.designs.setup import Setup, set_up_structures
 from daq.lookup.experiments import load_experiment
 from sysid import BatchSimulator, Discrimination, Excitation, ModelError, SearchSpace, discriminate
 from sysid.arrays import FloatArray
-from sysid.experiments import rivals
+from sysid.experiments import Prior, rivals
 from sysid.experiments.experiment import deviations_of
 from sysid.experiments.information import Informant
 from sysid.experiments.rivals import Answer, Hypothesis, nested
 from sysid.threads import Workers, available_cores, one_thread
 
 RATE, RUN = 800.0, 1.25  # Hz, s
+ACCURACY = 1e-2  # of rigs and fits alike, by the same steps
 STRONG = 10.0  # difference of BIC
 SPREAD = 0.6, 1.6  # of hidden values about the nominal ones
 
@@ -52,7 +56,10 @@ def main() -> None:
 
 
 def figures(question: TypedSettings, seeds: int) -> dict[str, Any]:
-    setups = set_up_structures(question)
+    setups = {
+        name: replace(each, prior=within_spread(each.space))
+        for name, each in set_up_structures(question).items()
+    }
     begin = time.perf_counter()
     designed = discrimination.choose(setups)
     seconds = time.perf_counter() - begin
@@ -70,6 +77,13 @@ def figures(question: TypedSettings, seeds: int) -> dict[str, Any]:
             for name, commands in runs.items()
         },
     }
+
+
+def within_spread(space: SearchSpace) -> Prior:
+    """What is known before: hidden values are the nominal ones, to within the spread."""
+    values = Prior.of_ranges(space).values
+    low, high = (space.encode(factor * values) for factor in SPREAD)
+    return Prior(values, np.diag((high - low) ** 2 / 12.0))
 
 
 def of_fixed(setups: Mapping[str, Setup], commands: Sequence[FloatArray]) -> Discrimination | None:
@@ -116,22 +130,19 @@ def separated(
         if answers is None:
             beyond += 1
             continue
-        # From what a wide search would come to as well: the truth, and any other point.
+        # From where a wide search would come to as well: the same brake in the rival's terms.
         tasks += [
-            (i, j, answers, drawn(each.space, rng), nested(each, truth.space.names, hidden))
+            (i, j, answers, nested(each, *in_terms_of(each, truth.space.names, hidden)))
             for j, each in enumerate(hypotheses)
         ]
     scores: dict[tuple[int, int], float] = {}
 
-    def fit(task: tuple[int, int, list[Answer], FloatArray, FloatArray]) -> None:
-        i, j, answers, *starts = task
-        rival, left = hypotheses[j], []
-        for begin in (rival.values, *starts):
-            end = rivals.refit(answers, rival, begin)
-            joints = [rivals.contrast(each, rival, end).joint for each in answers]
-            left.append(sum(joint[-1, -1] for joint in joints))
+    def fit(task: tuple[int, int, list[Answer], FloatArray]) -> None:
+        i, j, answers, start = task
+        rival = hypotheses[j]
+        left = min(rivals.refit(answers, rival, begin)[1] for begin in (rival.values, start))
         n = sum(each.outputs.size for each in answers)
-        scores[i, j] = float(min(left)) + len(rival.values) * float(np.log(n))
+        scores[i, j] = left + len(rival.values) * float(np.log(n))
 
     Workers(available_cores()).each(fit, tasks)
     names = [each.name for each in hypotheses]
@@ -142,6 +153,30 @@ def separated(
         "beyond_limits": beyond,
         "differences": told,
     }
+
+
+def in_terms_of(
+    rival: Hypothesis, names: Sequence[str], hidden: FloatArray
+) -> tuple[Sequence[str], FloatArray]:
+    """A hidden rig's values by name, its brake as the rival's law has it.
+
+    All three laws slide at a torque and yield at a rate: alpha z and sigma of Dahl's, of LuGre's
+    alpha / zeta and zeta, of Bouc-Wen's alpha A / (gamma + beta) and gamma + beta.
+    """
+    values = dict(zip(names, hidden.tolist(), strict=True))
+    bouc_wen = "A" in values
+    rate = values["gamma"] + values["beta"] if bouc_wen else values.get("zeta", 0.0)
+    rate = rate or values["sigma"]
+    slides = values["A"] / rate if bouc_wen else 1.0 / values.get("zeta", 1.0)
+    law = set(rival.space.names)
+    beta = rival.values[rival.space.names.index("beta")] if "beta" in law else 0.0
+    beta = min(values.get("beta", 0.1 * beta), 0.5 * rate)
+    per = {"A": values.get("A", rate), "gamma": rate - beta, "beta": beta}
+    per |= {"sigma": rate, "zeta": rate}
+    size = rate if "zeta" in law else rate / per["A"] if "A" in law else 1.0
+    per |= {name: values[name] * slides * size for name in ("alpha0", "alpha1")}
+    values |= per
+    return list(values), np.array(list(values.values()))
 
 
 def noisy(
@@ -156,7 +191,6 @@ def noisy(
     hidden: (n_free,), its parameters.
     """
     there = replace(truth, values=hidden)
-    noise = np.array([setup.noise[name] for name in setup.problem.model.output_names])
     of_inputs = np.array([setup.noise.get(name, 0.0) for name in setup.problem.model.input_names])
     answers = []
     for each in commands:
@@ -165,10 +199,14 @@ def noisy(
             return None
         (record,) = records
         steps = int(truth.simulator.steps_of_each(truth.space.full(hidden[None]), record)[0])
-        answer = rivals.answer(there, record, steps, np.isfinite(noise))
-        outputs = answer.outputs + noise * rng.standard_normal(answer.outputs.shape)
-        inputs = record.inputs + of_inputs * rng.standard_normal(record.inputs.shape)
-        answers.append(replace(answer, outputs=outputs, record=replace(record, inputs=inputs)))
+        answer, shape = rivals.answer(there, record, steps), record.inputs.shape
+        vector, n_steps = truth.space.full(hidden[None]), answer.n_steps
+        noisy = replace(record, inputs=record.inputs + of_inputs * rng.standard_normal(shape))
+        by_inputs = truth.simulator.trajectories(vector, noisy, n_steps)[0] - answer.outputs
+        # Of a speed between edges, what their instants err by as well.
+        variances = truth.informant.variances(record, answer.outputs[None])[0]
+        by_sensors = np.sqrt(variances) * rng.standard_normal(variances.shape)
+        answers.append(replace(answer, outputs=answer.outputs - by_inputs + by_sensors))
     return answers
 
 
@@ -183,9 +221,20 @@ def drawn(space: SearchSpace, rng: np.random.Generator) -> FloatArray:
 
 def hypothesis(name: str, setup: Setup) -> Hypothesis:
     model, space, prior = setup.problem.model, setup.space, setup.prior
-    simulator = BatchSimulator(model, threads=1)
+    simulator = BatchSimulator(model, accuracy=ACCURACY, threads=1)
     informant = Informant(simulator, space, *deviations_of(model, setup.noise))
     return Hypothesis(name, simulator, informant, space, prior.values, prior.information())
+
+
+def counts(seeds: Sequence[Mapping[str, Any]]) -> dict[str, tuple[int, int]]:
+    """How often each ordered pair was separated, and of how many rigs."""
+    differences: dict[str, list[float]] = {}
+    for each in seeds:
+        for pair, difference in each["differences"].items():
+            differences.setdefault(pair, []).append(difference)
+    return {
+        pair: (sum(d > STRONG for d in values), len(values)) for pair, values in differences.items()
+    }
 
 
 def show(figures: dict[str, Any]) -> None:
@@ -199,6 +248,9 @@ def show(figures: dict[str, Any]) -> None:
         shares = [f"{each['separated']} of {each['pairs']}" for each in seeds]
         print(f"\n{name}: separated {', '.join(shares)}; beyond limits "
               f"{[each['beyond_limits'] for each in seeds]}")  # fmt: skip
+        for pair, (separate, rigs) in counts(seeds).items():
+            if separate < rigs:
+                print(f"  {pair}: {separate} of {rigs}")
 
 
 if __name__ == "__main__":

@@ -119,19 +119,11 @@ def _show_pairs(result: DiscriminationResult) -> None:
             f"No run tells apart: {truth} and {rival}. What would: wider limits, longer runs, less "
             "noise, or another sensor."
         )
-    for contest in contests:
-        if not contest.possible and (contest.rival, contest.truth) not in _pairs(result):
-            terminal.print_text(
-                f"{contest.rival} does all that {contest.truth} does: where both fit alike, take "
-                f"{contest.truth}."
-            )
+    for truth, rival in result.discrimination.nested:
+        terminal.print_text(
+            f"{rival} does all that {truth} does: where both fit alike, take {truth}."
+        )
     _show_next(result)
-
-
-def _pairs(result: DiscriminationResult) -> set[tuple[str, str]]:
-    """Ordered pairs that no run tells apart."""
-    pairs = result.discrimination.inseparable
-    return {*pairs, *((rival, truth) for truth, rival in pairs)}
 
 
 def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:

@@ -50,6 +50,7 @@ class DiscriminationResult(RunsResult):
         return {
             "structures": dict(self.models),
             "pairs": [{**asdict(c), "told": c.told} for c in self.discrimination.contests],
+            "nested": [list(pair) for pair in self.discrimination.nested],
             "inseparable": [list(pair) for pair in self.discrimination.inseparable],
             **self.of_runs(self.discrimination),
         }

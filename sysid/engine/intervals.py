@@ -153,13 +153,18 @@ class IntervalSlopes:
     @cached_property
     def by_causes(self) -> FloatArray:
         """Over what acts, as of ``Intervals.causes``."""
+        return self._by_causes_at(slice(None))
+
+    def _by_causes_at(self, places: slice | list[int]) -> FloatArray:
         inputs = np.maximum(np.abs(self.intervals.inputs).max(axis=0, initial=0.0), _LEAST)
         # A rate counts by how far it moves a state.
         sizes = np.append(inputs, self._sizes / self.intervals.dt)
+        steps = _STEP * np.append(sizes, sizes[self.intervals.changing])
+        chosen = np.eye(len(steps))[places]
         begins, vector = self.states[:-1], self.intervals.vector
         return self._slopes(
-            lambda move: self.intervals.ends(begins, self._causes + move, vector),
-            _STEP * np.append(sizes, sizes[self.intervals.changing]),
+            lambda move: self.intervals.ends(begins, self._causes + move @ chosen, vector),
+            steps[places],
         )
 
     @cached_property
@@ -173,10 +178,12 @@ class IntervalSlopes:
 
     def by_input(self, j: int) -> tuple[FloatArray, FloatArray]:
         """Over input j at an interval's begin and at its end, (n_samples - 1, n_states) each."""
-        slopes, changing = self.by_causes, self.intervals.changing
+        changing, inputs = self.intervals.changing, self.intervals.inputs.shape[1]
         if j not in changing:
-            return slopes[:, j], np.zeros_like(slopes[:, j])
-        return slopes[:, j], slopes[:, slopes.shape[1] - len(changing) + changing.index(j)]
+            slopes = self._by_causes_at([j])
+            return slopes[:, 0], np.zeros_like(slopes[:, 0])
+        slopes = self._by_causes_at([j, inputs + self.states.shape[1] + changing.index(j)])
+        return slopes[:, 0], slopes[:, 1]
 
     def _slopes(self, ends: Callable[[FloatArray], FloatArray], steps: FloatArray) -> FloatArray:
         """Slopes of ends over causes, (n_causes,), by a step of each both ways."""

@@ -80,7 +80,9 @@ class LinearResponse:
         added = np.zeros(self.kept.shape)
         if outputs is not None:
             added[:, : outputs.shape[1]] = outputs
-        changes: FloatArray = _changes(self.rows, self.gains, self.onward, pushes, added, first)
+        changes: FloatArray = changes_along(
+            self.rows, self.gains, self.onward, pushes, added, first
+        )
         return changes * self.kept
 
 
@@ -97,7 +99,7 @@ def _push(pushes: FloatArray, slopes: FloatArray, causes: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _changes(
+def changes_along(
     rows: FloatArray,
     gains: FloatArray,
     onward: FloatArray,

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import takewhile
 
 import numpy as np
 
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.bench import Bench, FreeRun
 from sysid.experiments.excitation import Excitation
@@ -20,17 +21,26 @@ from sysid.experiments.experiment import (
 from sysid.experiments.feedback import Feedback
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
-from sysid.experiments.rivals import Answer, Hypothesis
+from sysid.experiments.rivals import FULL, ROUGH, Answer, Hypothesis
 from sysid.experiments.search import RunCandidate, Search
-from sysid.experiments.tournament import EVEN, AnsweredRun, Point, Tournament, power
+from sysid.experiments.tournament import (
+    CLEAR,
+    EVEN,
+    SURE,
+    AnsweredRun,
+    Point,
+    Tournament,
+    power,
+    shortfall,
+)
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
 from sysid.threads import Workers, available_cores, one_thread
 
-_REFITS = 3  # of all rivals, between generations of runs
+_REFITS = 2  # of all rivals, between generations of runs
 _SURE = 0.95  # power from which a pair counts as told apart
-_SHARPER = 0.1  # of the accuracy, with which the end is computed once more
+_COARSER, _COARSEST = 100.0, 0.1  # times the accuracy, and its end, while runs are searched for
 
 
 @dataclass(frozen=True)
@@ -72,6 +82,8 @@ class Discrimination(ChosenRuns):
     >>> other = Contest("b", "a", 0.0, 0.01, {}, possible=False)
     >>> Discrimination((run,), (one, other), attempts=64, refused=3).inseparable
     ()
+    >>> Discrimination((run,), (one, other), attempts=64, refused=3).nested
+    (('b', 'a'),)
     """
 
     contests: tuple[Contest, ...]
@@ -86,6 +98,16 @@ class Discrimination(ChosenRuns):
             if frozenset((c.truth, c.rival)) not in possible
         )
         return tuple(pair for pair in pairs if pair == tuple(sorted(pair)))
+
+    @property
+    def nested(self) -> tuple[tuple[str, str], ...]:
+        """Truths with rivals that do all they do, to within the noise, and more.
+
+        Such a rival is never refused: only the other direction tells, or that it needs more.
+        """
+        apart = {frozenset((c.truth, c.rival)) for c in self.contests if c.possible}
+        pairs = [(c.truth, c.rival) for c in self.contests if not c.possible]
+        return tuple(pair for pair in pairs if frozenset(pair) in apart)
 
 
 @one_thread()
@@ -104,7 +126,7 @@ def discriminate(
     candidates: int = 64,
     generations: int = 6,
     offspring: int = 16,
-    starts: int = 3,
+    starts: int = 2,
     accuracy: float = 1e-3,
     seed: int = 0,
     watch: Callable[[int, int], None] | None = None,
@@ -141,7 +163,9 @@ def discriminate(
     >>> [contest.probability > 0.99 for contest in result.contests]
     [True, True]
     """
-    structures = _structures(models, noise, spaces or {}, priors or {}, accuracy)
+    # Runs are searched for by coarser simulations.
+    coarse = min(_COARSER * accuracy, _COARSEST)
+    structures = _structures(models, noise, spaces or {}, priors or {}, coarse)
     rng, workers = np.random.default_rng(seed), Workers(available_cores())
     benches = benches or _free_runs(structures, limits or {}, margin)
     knowledge = [
@@ -151,25 +175,28 @@ def discriminate(
         each.space.full(prior.draws(each.space, checks, rng))
         for each, prior in zip(structures, knowledge, strict=True)
     ]
-    counted = np.array([name in noise for name in structures[0].simulator.model.output_names])
-    tournament = Tournament(structures, counted, workers, rng)
+    tournament = Tournament(structures, workers, rng)
+
+    refusals = dict.fromkeys(range(len(structures)), 0)
 
     def logged(inputs: FloatArray | Feedback, dt: float, n: int) -> list[Dataset] | None:
-        records = []
-        for structure, of_it in zip(structures, vectors, strict=True):
-            each = benches[structure.name].records(inputs, dt, of_it[:n])
+        records: dict[int, Dataset] = {}
+        for place in sorted(refusals, key=refusals.__getitem__, reverse=True):
+            bench = benches[structures[place].name]
+            each = bench.records(inputs, dt, vectors[place][:n])
             if each is None:
+                refusals[place] += 1  # is asked sooner, to be done with what will be refused
                 return None
-            records.append(each[0])
-        return records
+            records[place] = each[0]
+        return [records[place] for place in range(len(structures))]
 
     def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
         inputs = excitation.signal(genes)
         records = logged(inputs, excitation.dt, tried_with(inputs, 1, checks))
         if records is None:
             return None
-        answers = tournament.answers(records)
-        if not all(each.finite for each in answers):
+        answers = tuple(takewhile(lambda each: each.steady, tournament.answers(records)))
+        if len(answers) < len(records):
             return None
         return tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
 
@@ -177,31 +204,31 @@ def discriminate(
     confirm = partial(kept_by_all, lambda inputs, dt: logged(inputs, dt, checks))
     search = Search(excitations, evaluate, aim, rng, runs, workers, watch, confirm)
     search.scatter(candidates)
-    begins = tournament.begins(tournament.likeliest(), starts)
-    tournament.points.append(tournament.refit(_answers(search.pool[:runs]), begins)[0])
+    begins = tournament.begins(tournament.likeliest(), 1)
+    few = _answers(search.pool[: -(-runs // 2)])
+    tournament.points.append(tournament.refit(few, begins, ROUGH)[0])
     search.revise(tournament.judged)
     tournament.judge_possible(search.pool, runs)
-    best: tuple[float, list[RunCandidate], Point] = (-1.0, [], [])
+    sets: list[tuple[list[RunCandidate], Point, FloatArray]] = []
     for part in np.array_split(np.arange(generations), _REFITS):
-        search.aim = tournament.criterion()
+        search.revise(tournament.judged)
+        search.aim = aim = tournament.criterion()
         search.choose()
         for k in part:
             search.generation(offspring, k / max(generations - 1, 1))
             search.choose()
         chosen = [search.pool[i] for i in search.chosen]
-        point, distances = tournament.refit(_answers(chosen), tournament.points[-1:])
+        foreseen = aim.distances(search.total()[None])[0]
+        latest = tournament.points[-1:]
+        point, distances = tournament.refit(_answers(chosen), latest, ROUGH, foreseen, CLEAR)
         tournament.possible = tournament.possible | (power(distances) > EVEN)
-        worst = float(distances[tournament.possible].min())
-        best = max(best, (worst, chosen, point), key=lambda each: each[0])
         tournament.points.append(point)
-        search.revise(tournament.judged)
-    answers = _answers(best[1])
-    begins = tournament.begins(best[2], starts)
-    sharp = tournament.sharper(_SHARPER * accuracy)
-    sharper = [sharp.answers([a.record for a in run]) for run in answers]
-    end = sharp.refit(sharper, [tournament.refit(answers, begins)[0]])
-    contests = _contests(sharp, tournament.possible, *end)
-    runs_of_it = tuple(designed_run(candidate) for candidate in best[1])
+        sets.append((chosen, point, distances))
+    possible = tournament.possible
+    chosen, point, _ = min(sets, key=lambda each: float(shortfall(each[2][possible])))
+    begins = tournament.begins(point, starts)
+    contests = _contests(tournament, _answers(chosen), begins, accuracy)
+    runs_of_it = tuple(designed_run(candidate) for candidate in chosen)
     return Discrimination(
         runs_of_it, contests, attempts=search.attempts, refused=search.attempts - search.kept
     )
@@ -212,17 +239,28 @@ def _answers(runs: Sequence[RunCandidate]) -> list[tuple[Answer, ...]]:
 
 
 def _contests(
-    tournament: Tournament, possible: BoolArray, point: Point, distances: FloatArray
+    tournament: Tournament,
+    runs: Sequence[Sequence[Answer]],
+    begins: Sequence[Point],
+    accuracy: float,
 ) -> tuple[Contest, ...]:
-    """Every pair, its rival fitted as it is at a point."""
+    """Every pair, its rival fitted to what structures say of runs.
+
+    What is sure is left at that; rivals that come closer go to their ends, and by finer steps.
+    """
+    point, distances = tournament.refit(runs, begins, ROUGH)
+    point, distances = tournament.refit(runs, [point], FULL, distances, SURE)
+    sharp = tournament.sharper(accuracy)
+    sharper = [tuple(sharp.answers([a.record for a in run])) for run in runs]
+    point, distances = sharp.refit(sharper, [point], FULL, distances, SURE)
     contests = []
     for c, (i, j) in enumerate(tournament.pairs):
         truth, rival = tournament.structures[i], tournament.structures[j]
         probability = float(power(distances[c]))
         values = dict(zip(rival.space.names, point[c].tolist(), strict=True))
-        whether = bool(possible[c]) or probability > EVEN
+        possible = bool(tournament.possible[c]) or probability > EVEN
         contests.append(
-            Contest(truth.name, rival.name, float(distances[c]), probability, values, whether)
+            Contest(truth.name, rival.name, float(distances[c]), probability, values, possible)
         )
     return tuple(contests)
 

@@ -18,15 +18,18 @@ import numpy as np
 from scipy.linalg import pinvh
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.engine.intervals import Intervals
 from sysid.engine.scheme import LANES
 from sysid.engine.simulation import BatchSimulator
 from sysid.experiments.disturbance import with_disturbances
+from sysid.experiments.error_filter import ErrorFilter
 from sysid.identifiability import null_directions
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
 # Share of the largest information above which a direction that tells nothing is told something.
 _PHANTOM = 1e-10
+_FEWER = 3  # times the integration steps there are of what noise does
 _BURST = 1e3  # times its span, by which no output moves over the range of a parameter
 # Share of the largest scatter, of coordinates of like scatter, below which a direction has none.
 _LEAST, _TINY = 1e-9, 1e-300
@@ -92,11 +95,36 @@ class Informant:
         slopes = self._slopes(record, chromosome[None], n_free, unknown, 0, n_steps)
         return np.asarray(slopes[0])
 
-    def pushes(self, record: Dataset, chromosome: FloatArray) -> FloatArray:
-        """What draws of the inputs' noise do to the outputs, (n_samples, n_outputs, n_draws)."""
+    def error_filter(
+        self, record: Dataset, vector: FloatArray, outputs: FloatArray, n_steps: int
+    ) -> ErrorFilter:
+        """Of the errors of a record that parameters (n_parameters,) are right of.
+
+        outputs: (n_samples, n_outputs), what they say; n_steps: of the integration.
+        """
+        model, variances = self._simulator.model, self.variances(record, outputs[None])[0]
+        intervals = Intervals(model, vector, record.inputs, record.dt, -(-n_steps // _FEWER))
+        states = intervals.run(record.initial_state(model))
+        error_filter = ErrorFilter.along(intervals, states, variances, self._input_noise)
         if not len(self._noisy):
-            return np.zeros((*record.outputs.shape, 0))
-        return np.asarray(self._slopes(record, chromosome[None], 0, (), LANES)[0])
+            return error_filter
+        vectors = np.hstack([np.tile(vector, (LANES, 1)), np.eye(LANES)])
+        moved = self._disturbed.trajectories(vectors, self._with_errors(record, LANES), n_steps)
+        moved += np.sqrt(variances) * np.random.default_rng(0).standard_normal(moved.shape)
+        return error_filter.loosened((moved - outputs).reshape(LANES, -1).T)
+
+    def _with_errors(self, record: Dataset, count: int, seed: int = 0) -> Dataset:
+        """A record with channels for so many draws of each measured input's noise."""
+        places = self._noisy if count else self._noisy[:0]
+        shape = record.n_samples, len(places), count
+        errors = np.random.default_rng(seed).standard_normal(shape)
+        channels = (errors * self._input_noise[places, None]).reshape(record.n_samples, -1)
+        return replace(
+            record,
+            inputs=np.hstack([record.inputs, channels]),
+            input_zero=np.zeros(0),
+            input_noise=np.zeros(0),
+        )
 
     def _unknown(self, record: Dataset) -> list[int]:
         """Places of the states whose start a record does not tell."""
@@ -132,18 +160,12 @@ class Informant:
             steps = self._simulator.steps_of_each(vectors, record)[:, None]
         else:
             steps = np.full((n, 1), n_steps)
-        places = self._noisy if n_draws else self._noisy[:0]
-        shape = record.n_samples, len(places), n_channels
-        errors = np.random.default_rng(seed).standard_normal(shape)
-        channels = (errors * self._input_noise[places, None]).reshape(record.n_samples, -1)
-        with_errors = replace(
-            record,
-            inputs=np.hstack([record.inputs, channels]),
-            input_zero=np.zeros(0),
-            input_noise=np.zeros(0),
-        )
         (slopes,) = simulator.tangents(
-            np.hstack([vectors, quiet]), [with_errors], along, steps, start_directions=[moved]
+            np.hstack([vectors, quiet]),
+            [self._with_errors(record, n_channels, seed)],
+            along,
+            steps,
+            start_directions=[moved],
         )
         return slopes
 

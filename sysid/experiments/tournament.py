@@ -1,6 +1,6 @@
 """All ordered pairs of structures: which of them sets of runs tell apart."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -9,7 +9,7 @@ from scipy.special import ndtr, ndtri
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.experiments import rivals
-from sysid.experiments.rivals import Answer, Hypothesis
+from sysid.experiments.rivals import FULL, Answer, Effort, Hypothesis
 from sysid.experiments.search import RunCandidate
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError
@@ -17,9 +17,12 @@ from sysid.threads import Workers
 
 LEVEL = 0.01  # of the test by which a rival is refused
 EVEN = 0.5  # power below which a pair counts as not told apart
-_SECOND = 1e-3  # what pairs beside the worst count, so that of equal sets one is the best
 _ATTEMPTS = 200  # draws for one that keeps a model's constraints
+_MARGIN = 4.0  # of noncentralities, for other parameters: of half the difference
+_SECOND = 1e-3  # what counts where all is sure, so that of equal sets one is the best
 _LEAST = 1e-9  # noncentrality that counts as none
+# Noncentralities of which a refit to other runs will not make little, or one that goes further.
+CLEAR, SURE = 1000.0, 100.0
 
 Point = Sequence[FloatArray]
 """For each pair the rival's chromosome, (n_free,)."""
@@ -38,9 +41,21 @@ def power(noncentrality: FloatArray | float, level: float = LEVEL) -> FloatArray
     return np.asarray(ndtr(distance + ndtri(level)), dtype=np.float64)
 
 
+def shortfall(distances: FloatArray) -> FloatArray:
+    """How far rivals at noncentralities (..., n_pairs) are from being refused, (...).
+
+    The mean logarithm of the probabilities, of a fraction of the distances: parameters may be
+    others than those that a design starts from. A pair that hardly any run tells apart gains little
+    by twice as much of hardly anything, and does not hold others back, as in the least of all.
+    """
+    logarithms = np.log(power(distances / _MARGIN))
+    beyond = np.log(np.maximum(distances, _LEAST))
+    return np.asarray(-np.mean(logarithms + _SECOND * beyond, axis=-1))
+
+
 @dataclass(frozen=True)
 class Separation:
-    """A loss of what rivals leave: the worst pair counts.
+    """A loss of what rivals leave: the ``shortfall`` of pairs, in which the least ones count.
 
     ridges: (n_points * n_pairs, n, n). possible: (n_pairs,), the pairs that count. Each pair is as
     far apart as at the worst of the points at which its rival was tried.
@@ -49,13 +64,15 @@ class Separation:
     ridges: FloatArray
     possible: BoolArray
 
-    def losses(self, information: FloatArray) -> FloatArray:
-        """Of sums of runs' M, (n, n_points * n_pairs, n + 1, n + 1)."""
+    def distances(self, information: FloatArray) -> FloatArray:
+        """Of sums of runs' M, (n, n_points * n_pairs, n + 1, n + 1): (n, n_pairs)."""
         left = rivals.remainders(information, self.ridges)
-        left = left.reshape(len(left), -1, len(self.possible)).min(axis=1)[:, self.possible]
-        logarithms = np.log(np.maximum(left, _LEAST))
-        losses: FloatArray = -logarithms.min(axis=1) - _SECOND * logarithms.mean(axis=1)
-        return losses
+        least: FloatArray = left.reshape(len(left), -1, len(self.possible)).min(axis=1)
+        return least
+
+    def losses(self, information: FloatArray) -> FloatArray:
+        """Of sums of runs' M, (n,)."""
+        return shortfall(self.distances(information)[:, self.possible])
 
     def met(self, _information: FloatArray) -> bool:
         """Never: more runs tell more."""
@@ -73,17 +90,16 @@ class Tournament:
     """Each structure as the truth against each other as its rival.
 
     pairs: places of truth and rival. points: at which rivals have been fitted to some runs.
-    possible: (n_pairs,), whether any run that was tried can tell. counted: (n_outputs,).
+    possible: (n_pairs,), whether any run that was tried can tell.
     """
 
     def __init__(
         self,
         structures: Sequence[Hypothesis],
-        counted: BoolArray,
         workers: Workers,
         rng: np.random.Generator,
     ) -> None:
-        self.structures, self._counted, self._workers = structures, counted, workers
+        self.structures, self._workers = structures, workers
         self._rng, places = rng, range(len(structures))
         self.pairs = [(i, j) for i in places for j in places if i != j]
         self.points: list[Point] = []
@@ -95,16 +111,16 @@ class Tournament:
         finer = [
             replace(each, simulator=each.simulator.finer(accuracy)) for each in self.structures
         ]
-        return type(self)(finer, self._counted, self._workers, self._rng)
+        return type(self)(finer, self._workers, self._rng)
 
-    def answers(self, records: Sequence[Dataset]) -> tuple[Answer, ...]:
+    def answers(self, records: Sequence[Dataset]) -> Iterator[Answer]:
         """What each structure says of a run; records: of it, by the structures' benches."""
         pairs = list(zip(self.structures, records, strict=True))
         n_steps = max(
             int(each.simulator.steps_of_each(each.space.full(each.values)[None], record)[0])
             for each, record in pairs
         )
-        return tuple(rivals.answer(*each, n_steps, self._counted) for each in pairs)
+        return (rivals.answer(each, record, n_steps) for each, record in pairs)
 
     def judged(self, run: RunCandidate) -> AnsweredRun:
         """A run with the M of each pair at each point, points one after another."""
@@ -113,10 +129,15 @@ class Tournament:
         matrices = np.zeros((len(self.points) * n_pairs, n, n))
         done = len(run.information)
         matrices[:done] = run.information
-        for k, point in enumerate(self.points[done // n_pairs :], done // n_pairs):
-            for c, ((i, j), chromosome) in enumerate(zip(self.pairs, point, strict=True)):
-                matrix = rivals.scaled(run.answers[i], self.structures[j], chromosome)
-                matrices[k * n_pairs + c] = self._padded(matrix)
+        for place in range(done, len(matrices)):
+            k, c = divmod(place, n_pairs)
+            i, j = self.pairs[c]
+            if k and self.points[k][c] is self.points[k - 1][c]:
+                matrices[place] = matrices[place - n_pairs]
+                continue
+            each = rivals.contrast(run.answers[i], self.structures[j], self.points[k][c])
+            if np.isfinite(each.joint).all():  # else the run tells nothing
+                matrices[place] = self._padded(each.joint)
         return replace(run, information=matrices)
 
     def unjudged(self) -> FloatArray:
@@ -150,25 +171,28 @@ class Tournament:
         return [self._anywhere(self.structures[j]) for _, j in self.pairs]
 
     def refit(
-        self, runs: Sequence[Sequence[Answer]], begins: Sequence[Point]
+        self,
+        runs: Sequence[Sequence[Answer]],
+        begins: Sequence[Point],
+        effort: Effort = FULL,
+        distances: FloatArray | None = None,
+        below: float = np.inf,
     ) -> tuple[Point, FloatArray]:
-        """Fit all rivals to runs from several points: the best, and noncentralities (n_pairs,).
+        """Fit rivals to runs from several points: where they end, noncentralities (n_pairs,).
 
-        runs: what each structure says of each.
+        runs: what each structure says of each. Where distances (n_pairs,) are not below a level
+        they are taken as they are, and rivals stay at the first of the points.
         """
-        n_pairs = len(self.pairs)
-        ends: list[tuple[float, FloatArray]] = [(np.inf, begin) for p in begins for begin in p]
+        point = list(begins[0])
+        left = np.zeros(len(point)) if distances is None else distances.copy()
 
-        def fit(place: int) -> None:
-            i, j = self.pairs[place % n_pairs]
-            answers, rival = [each[i] for each in runs], self.structures[j]
-            end = rivals.refit(answers, rival, ends[place][1])
-            left = rivals.noncentrality(answers, rival, end)
-            ends[place] = left if np.isfinite(left) else np.inf, end
+        def fit(c: int) -> None:
+            (i, j), starts = self.pairs[c], [begin[c] for begin in begins]
+            answers = [each[i] for each in runs]
+            point[c], left[c] = rivals.refit(answers, self.structures[j], *starts, effort=effort)
 
-        self._workers.each(fit, range(len(ends)))
-        best = [min(ends[c::n_pairs], key=lambda end: end[0]) for c in range(n_pairs)]
-        return [end for _, end in best], np.array([left for left, _ in best])
+        self._workers.each(fit, np.flatnonzero(left < below).tolist())
+        return point, left
 
     def judge_possible(self, pool: Sequence[RunCandidate], most: int) -> None:
         """Find out which pairs so many of the runs in a pool could tell apart.

@@ -21,8 +21,9 @@ from sysid import (
 )
 from sysid.experiments.information import Informant
 from sysid.experiments.prior import Prior
-from sysid.experiments.rivals import Hypothesis, answer, contrast, noncentrality, refit, scaled
-from sysid.experiments.tournament import power
+from sysid.experiments.rivals import Hypothesis, answer, contrast, refit
+from sysid.experiments.tournament import AnsweredRun, Tournament, power, shortfall
+from sysid.threads import Workers
 from tests.sysid.support import blank
 
 DT, NOISE = 0.01, 0.05
@@ -74,10 +75,10 @@ def waves(lowest=0.0):
     return Excitation("wave", settings, inputs, DT)
 
 
-def structure(model, input_noise=0.0):
+def structure(model, output_noise=NOISE):
     space, simulator = SearchSpace.of(model), BatchSimulator(model)
     prior = Prior.of_ranges(space)
-    noise = np.array([NOISE]), np.array([input_noise])
+    noise = np.array([output_noise]), np.array([0.0])
     informant = Informant(simulator, space, *noise)
     return Hypothesis(model.name, simulator, informant, space, prior.values, prior.information())
 
@@ -85,13 +86,13 @@ def structure(model, input_noise=0.0):
 def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
     u = np.linspace(-0.5, 1.5, 60)
     truth, rival = structure(SQUARE), structure(LINEAR)
-    told = answer(truth, blank(SQUARE, u[:, None], DT), 1, np.array([True]))
-    end = refit([told], rival, np.array([4.0]))
+    told = answer(truth, blank(SQUARE, u[:, None], DT), 1)
+    end, left = refit([told], rival, np.array([4.0]))
     y = u + 0.3 * u * u
     best = float(y @ u / (u @ u))
-    assert end == pytest.approx([best], rel=1e-6)
+    assert end == pytest.approx([best], rel=1e-3)
     exact = np.sum((y - best * u) ** 2) / NOISE**2
-    assert noncentrality([told], rival, end) == pytest.approx(exact, rel=1e-6)
+    assert left == pytest.approx(exact, rel=1e-4)
 
 
 @pytest.mark.soak
@@ -104,38 +105,43 @@ def test_a_rival_is_fitted_to_noisy_logs_as_well_as_it_can_be():
         ("q", 1.0, -1.0, 3.0),
     )
     u, rng = np.arange(2000) % 2.0, np.random.default_rng(0)
-    rival = structure(valley)
-    exact = answer(rival, blank(valley, u[:, None], DT), 1, np.array([True]))
+    rival = structure(valley, 100.0 * NOISE)
+    exact = answer(rival, blank(valley, u[:, None], DT), 1)
     noise = 100.0 * NOISE * rng.standard_normal(exact.outputs.shape)
-    log = replace(exact, outputs=exact.outputs + noise, weights=exact.weights / 1e4)
-    end = refit([log], rival, np.array([-1.2, 1.0]))
+    log = replace(exact, outputs=exact.outputs + noise)
+    end, left = refit([log], rival, np.array([-1.2, 1.0]))
     halves = [log.outputs[u == side, 0] for side in (0.0, 1.0)]
     least = sum(float(np.sum((y - y.mean()) ** 2)) for y in halves) / (100.0 * NOISE) ** 2
-    assert contrast(log, rival, end).joint[-1, -1] == pytest.approx(least, abs=1.0)
+    assert left == pytest.approx(least, abs=1.0)
+    assert contrast(log, rival, end).joint[-1, -1] == pytest.approx(left)
 
 
 @pytest.mark.soak
 def test_a_rival_that_blows_up_on_its_way_is_fitted_all_the_same():
     grows = growth()
     one = structure(grows)
-    told = answer(one, blank(grows, np.ones((60, 1)), DT), 4, np.array([True]))
+    told = answer(one, blank(grows, np.ones((60, 1)), DT), 4)
     for start in (3.0, 790.0):
-        end = refit([told], one, np.array([start]))
+        end, _ = refit([told], one, np.array([start]))
         assert np.isfinite(end).all()
-    assert refit([told], one, np.array([3.0])) == pytest.approx([-1.0], rel=1e-3)
+    assert refit([told], one, np.array([3.0]))[0] == pytest.approx([-1.0], rel=1e-3)
 
 
-@pytest.mark.soak
-def test_noise_of_an_input_counts_as_the_test_scatters():
-    u, sigma = np.linspace(-0.5, 1.5, 60), 0.1
-    truth, rival = structure(SQUARE, sigma), structure(LINEAR, sigma)
-    told = answer(truth, blank(SQUARE, u[:, None], DT), 1, np.array([True]))
-    # Drawn 16 times a sample: to within the mean of so many squares.
-    variances = NOISE**2 + ((1.0 + 0.6 * u) * sigma) ** 2
-    assert 1.0 / told.weights[:, 0] == pytest.approx(variances, rel=1.5)
-    assert float(np.mean(1.0 / told.weights[:, 0] / variances)) == pytest.approx(1.0, rel=0.1)
-    left = contrast(told, rival, np.array([1.2]))
-    assert 0.6 < left.efficiency() < 1.7  # white after all, for the spring answers at once
+def test_of_several_starts_the_one_that_leaves_least_goes_on():
+    """Of a sine's frequency there are many minima; none is at the end of the range."""
+    wave = spring("wave", lambda u, p: np.sin(p[0] * u), ("w", 12.0, 1.0, 400.0))
+    rival = structure(wave)
+    told = answer(rival, blank(wave, np.linspace(-3.0, 3.0, 200)[:, None], DT), 1)
+    starts = [np.array([w]) for w in (3.3, 150.0, 11.5, 60.0)]
+    end, left = refit([told], rival, *starts)
+    assert end == pytest.approx([12.0], rel=1e-4)
+    assert left < 0.1 < refit([told], rival, starts[0])[1]
+
+
+def test_a_pair_that_nothing_tells_does_not_hold_the_others_back():
+    assert shortfall(np.array([0.01, 12.0])) < shortfall(np.array([0.02, 6.0]))
+    assert shortfall(np.array([40.0, 40.0])) < shortfall(np.array([10.0, 1e6]))
+    assert shortfall(np.array([2e4, 2e4])) < shortfall(np.array([1e4, 1e4]))
 
 
 @pytest.mark.soak
@@ -154,6 +160,7 @@ def test_the_runs_that_tell_pairs_apart_are_at_the_limits_and_beside_zero():
         assert contest.distance < 1e-3
         assert contest.values["k"] == pytest.approx(1.0, rel=1e-3)
     assert result.inseparable == ()
+    assert set(result.nested) == {("linear", "square"), ("linear", "cubic")}
     for run in result.runs:
         reach = np.abs(run.inputs).max()
         assert 1.5 < reach <= 1.8
@@ -182,9 +189,31 @@ def test_the_worst_pair_is_as_far_apart_as_a_search_of_all_runs_finds():
 
 def test_a_run_in_which_a_rival_fails_tells_nothing():
     one = structure(growth())
-    told = answer(one, blank(growth(), np.ones((60, 1)), DT), 4, np.array([True]))
-    assert scaled(told, one, np.array([0.5]))[-1, -1] > 1.0
-    assert not scaled(told, one, np.array([5000.0])).any()
+    told = answer(one, blank(growth(), np.ones((60, 1)), DT), 4)
+    tournament = Tournament([one, one], Workers(1), np.random.default_rng(0))
+    tournament.points = [[np.array([0.5]), np.array([5000.0])]]
+    run = AnsweredRun(waves(), np.zeros(2), tournament.unjudged(), (told, told))
+    told_by_it = tournament.judged(run).information
+    assert told_by_it[0, -1, -1] > 1.0
+    assert not told_by_it[1].any()
+
+
+@pytest.mark.parametrize(("level", "steady"), [(10.0, True), (0.0, False)])
+def test_a_run_whose_states_bend_within_the_noise_is_not_steady(level, steady):
+    square_law = ProcessModel(
+        name="square_law",
+        states=(State("x", "1"),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("x", "1"),),
+        parameters=(Parameter("rate", "1/s", 5.0, 1.0, 20.0),),
+        derivative=lambda x, u, p: (p[0] * (u[0] * u[0] - x[0]),),
+    )
+    space, simulator = SearchSpace.of(square_law), BatchSimulator(square_law)
+    informant = Informant(simulator, space, np.array([1e-3]), np.array([1.0]))
+    prior = Prior.of_ranges(space)
+    truth = Hypothesis("square_law", simulator, informant, space, prior.values, prior.information())
+    inputs = level + 0.1 * np.sin(np.arange(300) * 0.1)
+    assert answer(truth, blank(square_law, inputs[:, None], DT), 2).steady == steady
 
 
 def test_one_seed_gives_one_result_whatever_the_threads(monkeypatch):
