@@ -116,7 +116,11 @@ class BatchKernel(Scheme):
         ]
         if paired:
             return block(f"for l in range({LANES // 2}):", _paired(lines))
-        return block(EACH_LANE, lines)
+        return self._each_lane(lines)
+
+    def _each_lane(self, *parts: Sequence[str]) -> list[str]:
+        """What is done of every lane in turn."""
+        return block(EACH_LANE, *parts)
 
     def _inputs_of_lane(self) -> list[str]:
         """Inputs that are lane l's, where not all have the same."""

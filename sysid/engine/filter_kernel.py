@@ -18,7 +18,7 @@ all samples: without noise of inputs and process, and of one variance, the error
 Noise of the inputs may be coloured: n_(k+1) is then a part of n_k, the colour, and what is new in
 it. With noise of the process the sum of log(s / r) stands behind the sum of their squares. With
 ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s its variance.
-Chromosomes are lanes, as in the batch kernel.
+Chromosomes are lanes, as in the batch kernel; ``halves`` of them, one or two, are worked out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,6 +33,7 @@ _Place = tuple[int, int]
 _ROOT_3 = repr(3.0**0.5)
 _WEIGHTS = ("before", "now", "between", "so_far")
 _OF_MEAN, _OF_SUM = 0, 1
+_HALF = LANES // 2
 
 
 class FilterKernel(BatchKernel):
@@ -95,14 +96,14 @@ class FilterKernel(BatchKernel):
             *self._weights_of_means(),
             *self._traced("before"),
             *[f"copy_row(X, {self.innovation + j}, y, k * {q} + {j})" for j in outputs],
-            *block(EACH_LANE, self._corrected()),
+            *self._each_lane(self._corrected()),
             *residuals_kept(q, self.innovation),
             *self._traced("after"),
             *block("if k == n_samples - 1:", ["break"]),
             *self._input_slopes(),
-            *block(EACH_LANE, self._undisturbed()),
+            *self._each_lane(self._undisturbed()),
             *block("for step in range(n_steps):", self._stage_inputs(), self._all_lanes(False)),
-            *block(EACH_LANE, self._predicted()),
+            *self._each_lane(self._predicted()),
         ]
         sums = f"sums[j, l] = X[({self._sums} + j) * {LANES} + l]"
         body = [
@@ -121,9 +122,14 @@ class FilterKernel(BatchKernel):
         ]
         head = (
             "def innovations(X, rows, tables, u, y, w, r, unit, mean, s, colour, intensity, "
-            "spread, corrects, start, p, dt, n_steps, sums, record, before, after):"
+            "spread, corrects, start, p, dt, n_steps, halves, sums, record, before, after):"
         )
         return "\n".join(block(head, body))
+
+    def _each_lane(self, *parts: Sequence[str]) -> list[str]:
+        """Of half of the lanes, or all: many fits ask for the innovations of one chromosome."""
+        lanes = f"for l in range({_HALF} * half, {_HALF} * half + {_HALF}):"
+        return block("for half in range(halves):", block(lanes, *parts))
 
     def _traced(self, table: str) -> list[str]:
         """Keep the first lane's work area, before a sample's outputs or after them."""

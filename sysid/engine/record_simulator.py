@@ -242,7 +242,8 @@ class RecordSimulator:
                 work, work.reshape(-1, LANES), kernel.tables, inputs, measured, weights,
                 variances, unit, mean, of_inputs, colour, intensity, np.array(spread),
                 float(settings.corrects), start,
-                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps, sums, kept, *traces,
+                np.ascontiguousarray(parameters[padded].T), record.dt, n_steps,
+                -(-len(lanes) // (LANES // 2)), sums, kept, *traces,
             )  # fmt: skip
         values[..., _neighbours(lanes)] = kept[..., : len(lanes)]
         sse, logarithms = (half.T[: len(lanes)] for half in np.split(sums, 2))
