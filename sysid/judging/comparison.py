@@ -376,7 +376,9 @@ def _against(row: Row, best: str) -> str:
 
 def times(ratio: float) -> str:
     """A ratio of squared errors, as finely as it tells structures apart."""
-    return f"{ratio:.3g}" if abs(ratio) >= 10.0 else f"{ratio:.3f}"
+    if abs(ratio) >= 10.0:
+        return f"{ratio:.3g}"
+    return f"{ratio:.3f}" if abs(ratio - 1.0) < 0.1 else f"{ratio:.2f}"
 
 
 def above(criterion: float) -> str:

@@ -182,11 +182,12 @@ def _significant(coherence: FloatArray, left: float, density: FloatArray) -> Boo
     9.2. Its bound, 1 - alpha^(1/left), is at the alpha by which 5 % of the points beyond it are
     noise: Benjamini & Hochberg, J. R. Stat. Soc. B 57 (1995) 289.
     """
-    from scipy.stats import false_discovery_control
-
     powered = (density > _FLOOR * density.max(axis=0))[:, None, :] & np.isfinite(coherence)
-    chance = np.where(powered, (1.0 - np.nan_to_num(coherence)) ** left, 1.0)
-    significant: BoolArray = false_discovery_control(np.clip(chance, 0.0, 1.0), axis=0) < _FALSE
+    chance = np.where(powered, (1.0 - np.clip(np.nan_to_num(coherence), 0.0, 1.0)) ** left, 1.0)
+    in_order = np.sort(chance, axis=0)
+    places = np.arange(1, len(chance) + 1) / len(chance)
+    passing = in_order <= _FALSE * places[:, None, None]
+    significant: BoolArray = chance <= np.where(passing, in_order, -1.0).max(axis=0)
     return significant
 
 
