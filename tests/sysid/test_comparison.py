@@ -133,7 +133,7 @@ def test_the_better_structure_wins_by_more_than_chance():
     assert wrong.ratio.value == pytest.approx(2.0, abs=0.15)
     assert wrong.ratio.low > 1.8 and wrong.ratio.high < 2.2 and wrong.ratio.p_value < 1e-6
     assert "right explains the validation data best. wrong has squared errors" in result.verdict
-    assert f"{wrong.ratio.value:.3f} times those of right" in result.verdict
+    assert f"{wrong.ratio.value:.2f} times those of right" in result.verdict
     assert "worse, by more than chance (p < 0.001)" in result.verdict
 
 
