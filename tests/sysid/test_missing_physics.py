@@ -270,8 +270,9 @@ def test_a_variant_that_the_data_ask_for_is_fitted_and_ranked():
     assert reason.startswith("The model lacks friction=dry; fitted with it: ")
     # Damping as it is, now that friction has a term of its own.
     words = reason.split()
-    damping = float(words[words.index("B") + 3])
-    assert damping == pytest.approx(TRUTH["B"], rel=0.3)
+    damping, unit = words[words.index("B") + 3 :][:2]
+    assert unit.startswith("µN*m*s")
+    assert 1e-6 * float(damping) == pytest.approx(TRUTH["B"], rel=0.3)
     # A model that has it asks for nothing.
     right = replace(WITH_FRICTION, variants=lambda: {"friction=dry": WITH_FRICTION})
     fitted = GASSI(right, population=60, generations=12).fit(training)
