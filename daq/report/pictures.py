@@ -205,7 +205,7 @@ def _residuals(subject: Subject) -> Iterator[Picture]:
     data = log.dataset
     if not np.isfinite(run).all():
         return
-    lags = min(max(LAGS, math.ceil(_memory(subject) / data.dt)), _MOST_LAGS)
+    lags = max(LAGS, math.ceil(min(_memory(subject) / data.dt, _MOST_LAGS)))
     test = residual_test(data.outputs - run, data.inputs, data.input_noise, lags)
     which = f"{data.name}, the first of {len(logs)}" if len(logs) > 1 else data.name
     shares = f" The table's shares are of the first {LAGS} lags." * (len(test.lags) > LAGS)

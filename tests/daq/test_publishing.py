@@ -178,12 +178,12 @@ from sysid import Input, Output, Parameter, ProcessModel, State
 
 model = ProcessModel(
     name="two lags",
-    states=(State("y", "m"), State("z", "m"), State("slow", "V")),
+    states=(State("y", "m"), State("z", "m"), State("slow", "V"), State("hardly", "V")),
     inputs=(Input("u", "V"),),
     outputs=(Output("y", "m"), Output("z", "m")),
     parameters=(Parameter("tau", "s", 0.3, 0.05, 1.0, "log"),),
     derivative=lambda x, u, p: (
-        (2.0 * u[0] - x[0]) / p[0], (2.0 * u[0] - x[1]) / p[0], u[0] - x[2]
+        (2.0 * u[0] - x[0]) / p[0], (2.0 * u[0] - x[1]) / p[0], u[0] - x[2], -5e-324 * x[3]
     ),
 )
 """
