@@ -29,9 +29,9 @@ _TEX_OPERATORS = {" - ": " $-$ ", " + ": " $+$ "}
 _TEX_UNITS = {"*": r"\,", "ohm": r"\ensuremath{\Omega}"}
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-# Not before a power, which would raise the prefix too: 1 mm^2 is not 1e-3 m^2.
 # What stands behind a number in a sentence and has a sign of multiplication or a power in it.
 _UNIT_BEHIND = re.compile(r"(?<=\d )[^\W\d]\w*(?:[*/^]-?\(?\w+\)?)+")
+# Not before a power, which would raise the prefix too: 1 mm^2 is not 1e-3 m^2.
 _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
 
 

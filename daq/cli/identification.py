@@ -264,11 +264,9 @@ def _show_residuals(rows: Rows, noisy: bool) -> None:
     terminal.print_table(title, head, cells)
     coloured = [name for name, (past, *_) in table.shares.items() if past < _COLOURED]
     if coloured:
-        cause = (
-            "as noise of a measured input makes them"
-            if noisy
-            else ("as what the model lacks makes them, or a sensor's own noise")
-        )
+        cause = "as what the model lacks makes them, or a sensor's own noise"
+        if noisy:
+            cause = "as noise of a measured input makes them"
         terminal.print_text(
             f"Few with itself ({', '.join(coloured)}): coloured residuals, {cause}. The intervals "
             "allow for it; few with an input would speak against the model."
@@ -432,12 +430,12 @@ def _runs_lines(campaign: Campaign) -> list[str]:
 
 
 def _validation_row(row: Row) -> list[str]:
+    from sysid.judging.comparison import times
+
     cells = [
         f"{terminal.number(float(rmse), 3)} ({fit:.1f})"
         for rmse, fit in zip(row.rmse, row.fit, strict=True)
     ]
-    from sysid.judging.comparison import times
-
     ratio = row.ratio
     if ratio is None:
         return [row.name, *cells, "", "", row.verdict]

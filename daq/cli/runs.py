@@ -104,7 +104,8 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str, room: i
     """A row for each run, of the last for which there is room; what none of them has is left out.
 
     A terminal has little room: what is the same in all runs is said once there, above them, and a
-    date only where the run's name does not begin with it.
+    date only where the run's name does not begin with it. Names of runs stay whole: they are copied
+    from here.
     """
     if len(entries) > room:
         terminal.report("note", f"the last {room} are shown; --last N shows so many")
@@ -126,34 +127,11 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str, room: i
     kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
     if sys.stdout.isatty() and all(map(_is_dated, entries)):
         kept.remove(1)
-    if sys.stdout.isatty():
-        kept = _with_room(kept, head, rows, noted)
     texts = [name for name in head if name not in titles]
     terminal.print_table_of_differences(
         title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows],
-        once=texts[1:], text=texts,
+        once=texts[1:], text=texts, spare=noted, elsewhere="--details shows all of a run",
     )  # fmt: skip
-
-
-def _with_room(
-    kept: Sequence[int], head: Sequence[str], rows: Sequence[Sequence[str]], noted: Sequence[str]
-) -> list[int]:
-    """Columns without those of the longest free keys, for which a terminal has no room.
-
-    Names of runs stay whole: they are copied from here.
-    """
-    kept, left_out = list(kept), list[str]()
-    widths = [max(map(len, column)) + 3 for column in zip(head, *rows, strict=True)]
-    differing = [k for k in range(len(head)) if k == 0 or len({row[k] for row in rows}) > 1]
-    columns = shutil.get_terminal_size().columns
-    for longest in sorted((k for k in kept if head[k] in noted), key=lambda k: -widths[k]):
-        if sum(widths[k] for k in kept if k in differing) <= columns:
-            break
-        kept.remove(longest)
-        left_out.append(head[longest])
-    if left_out:
-        terminal.report("note", f"no room for {', '.join(left_out)}: --details shows all of a run")
-    return kept
 
 
 def _is_dated(entry: RunEntry) -> bool:

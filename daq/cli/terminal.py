@@ -239,11 +239,12 @@ def _piped(rows: Iterable[Sequence[str]], words: Sequence[bool]) -> list[str]:
 
 def print_table_of_differences(
     title: str, head: Sequence[str], rows: Sequence[Sequence[str]], once: Sequence[str],
-    text: Sequence[str] = (),
+    text: Sequence[str] = (), spare: Sequence[str] = (), elsewhere: str = "",
 ) -> None:  # fmt: skip
     """A table; on a terminal, which has little room, without columns of ``once`` that are alike.
 
-    What they are in all rows is said behind the title.
+    What they are in all rows is said behind the title. Of the columns of ``spare`` the longest are
+    left out there as well, until the others need no folding; elsewhere: what shows them all.
     """
     alike: list[int] = []
     if sys.stdout.isatty():
@@ -251,7 +252,25 @@ def print_table_of_differences(
         alike = [k for k in columns if len({row[k] for row in rows}) == 1]
         title += "".join(f"; {head[k]} {rows[0][k]}" for k in alike)
     kept = [k for k in range(len(head)) if k not in alike]
+    if sys.stdout.isatty():
+        widths = [max(map(len, _lines(column))) for column in zip(head, *rows, strict=True)]
+        left_out = _beyond_width(kept, widths, [k for k in kept if head[k] in spare])
+        kept = [k for k in kept if k not in left_out]
+        if left_out:
+            names = ", ".join(head[k] for k in left_out)
+            report("note", f"no room for {names}: {elsewhere}")
     print_table(title, [head[k] for k in kept], [[row[k] for k in kept] for row in rows], text)
+
+
+def _beyond_width(kept: Sequence[int], widths: Sequence[int], spare: Sequence[int]) -> list[int]:
+    """The longest of the spare columns that a terminal has no room for, of those kept."""
+    whole, left_out = sum(widths[k] + 3 for k in kept), list[int]()
+    for longest in sorted(spare, key=lambda k: -widths[k]):
+        if whole <= shutil.get_terminal_size().columns:
+            break
+        whole -= widths[longest] + 3
+        left_out.append(longest)
+    return left_out
 
 
 def _lines(cells: Iterable[str]) -> list[str]:

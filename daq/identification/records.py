@@ -65,8 +65,7 @@ class LoggedRecord(Shown):
 
     measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``; None
     where that leaves none out. preparation: what was done to it before, None for nothing. merged:
-    files with columns of it. cut: where not all of it is used. of_a_rig: whether it is a run's log,
-    with all that a run logs.
+    files with columns of it. of_a_rig: whether it is a run's log, with all that a run logs.
     """
 
     dataset: Dataset
@@ -75,7 +74,6 @@ class LoggedRecord(Shown):
     measured: Dataset | None = None
     preparation: Preparation | None = None
     merged: tuple[Path, ...] = ()
-    cut: Cut | None = None
     of_a_rig: bool = False
 
     @property
@@ -221,8 +219,8 @@ def from_recording(
     time = recording.columns["t"]
     whole = partial(_from_log, recording, model, recording.name, EVERYTHING, speeds)
     cut = _cut(selection, recording.path, time, whole)
-    log = LoggedRecord(dataset, recording.path, recording.warning, cut=cut, of_a_rig=True)
-    return _prepared(log, model, selection)
+    log = LoggedRecord(dataset, recording.path, recording.warning, of_a_rig=True)
+    return _prepared(log, model, selection, cut)
 
 
 def from_frame(
@@ -252,21 +250,27 @@ def from_frame(
     columns["tick"], dt = time_base(path, columns["t"], first_line=0)
     log = Recording(path, columns, dt)
     cut = _cut(selection, path, columns["t"], partial(_from_log, log, model, name, EVERYTHING))
-    record = LoggedRecord(_from_log(log, model, name, selection), path, None, cut=cut)
-    return _prepared(record, model, selection)
+    record = LoggedRecord(_from_log(log, model, name, selection), path, None)
+    return _prepared(record, model, selection, cut)
 
 
-def _prepared(log: LoggedRecord, model: ProcessModel, selection: Selection) -> LoggedRecord:
-    """A log as ``delay``, ``detrend``, ``decimate``, ``run_in`` and ``robust`` want it."""
+def _prepared(
+    log: LoggedRecord, model: ProcessModel, selection: Selection, cut: Cut | None
+) -> LoggedRecord:
+    """A log as ``delay``, ``detrend``, ``decimate``, ``run_in`` and ``robust`` want it.
+
+    cut: where not all of it is used.
+    """
     dataset = selection.with_averages(selection.with_noise(log.dataset, model), model)
     log = replace(log, dataset=dataset)
-    steps, used, start = _merging(log) + _cutting(log), log.dataset, 0.0
+    steps = (*_merging(log), *([] if cut is None else [cut.step]))
+    used, start = log.dataset, 0.0
     if selection.preparation.needed:
         made = selection.prepared(used, log.path, model)
         steps, start = steps + made.steps, made.start
         log = replace(log, dataset=replace(made.dataset, begin=used.begin + start))
     if steps:
-        before = used if log.cut is None else log.cut.whole
+        before = used if cut is None else cut.whole
         start += used.begin - before.begin
         log = replace(log, preparation=Preparation(steps, before, used, log.dataset, start))
     log = replace(log, dataset=_without_run_in(log.dataset, log.path, model, selection))
@@ -275,10 +279,6 @@ def _prepared(log: LoggedRecord, model: ProcessModel, selection: Selection) -> L
 
 def _merging(log: LoggedRecord) -> tuple[str, ...]:
     return (f"merged with {', '.join(map(str, log.merged))}",) if log.merged else ()
-
-
-def _cutting(log: LoggedRecord) -> tuple[str, ...]:
-    return () if log.cut is None else (log.cut.step,)
 
 
 def _cut(
@@ -334,8 +334,8 @@ def _foreign(
         return replace(record, begin=float(table.time[0]))
 
     cut = _cut(selection, path, table.time, whole)
-    log = LoggedRecord(dataset, path, warning, merged=tuple(others), cut=cut)
-    return _prepared(log, model, selection)
+    log = LoggedRecord(dataset, path, warning, merged=tuple(others))
+    return _prepared(log, model, selection, cut)
 
 
 def hold_back(logs: list[LoggedRecord], part: float) -> Split:

@@ -181,11 +181,8 @@ def _as_searched(model: ProcessModel, space: SearchSpace) -> ProcessModel:
 
 def named_values(space: SearchSpace, chromosome: FloatArray) -> dict[str, float]:
     """All the model's parameters, and the starts that are estimated, by name."""
-    names, free = (
-        space.model.parameter_names,
-        dict(zip(space.names, chromosome.tolist(), strict=True)),
-    )
-    return dict(zip(names, space.full(chromosome).tolist(), strict=True)) | free
+    columns = named_columns(space, chromosome[None])
+    return {name: float(values[0]) for name, values in columns.items()}
 
 
 def named_columns(space: SearchSpace, chromosomes: FloatArray) -> dict[str, FloatArray]:

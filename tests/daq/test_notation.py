@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daq import notation
+from sysid.judging.phrases import sized
 
 
 @pytest.mark.parametrize(
@@ -86,3 +87,14 @@ def test_equations_have_derivatives_and_no_signs_of_products():
         "<i>L</i><sub>m</sub> d<i>i</i><sub>m</sub>/d<i>t</i> = "
         "−<i>R</i><sub>m</sub>\u2009<i>i</i><sub>m</sub> − |<i>z</i>|<sup>2</sup>"
     )
+
+
+@given(
+    st.floats(1e-11, 1e8) | st.floats(-1e8, -1e-11),
+    st.sampled_from(["A", "N*m", "N*m*s/rad", "s", "kg*m^2", "m^2", "1/s", "1"]),
+)
+def test_sentences_have_the_multiple_that_tables_have(value, unit):
+    scale, multiple = notation.engineering(value, unit)
+    number, _, behind = sized(value, unit).partition(" ")
+    assert behind == ("" if multiple == "1" else multiple)
+    assert float(number) == pytest.approx(scale * value, rel=6e-3)
