@@ -162,7 +162,7 @@ def candidates(
     added = lambdas[:, :, None] * scale[:, None]
     added = np.concatenate([added[:, :-1], equal, added[:, -1:]], axis=1)
     steps = _damped(root, right, added, low, high)
-    beyond = _infeasible(space, at + steps * width)
+    beyond = infeasible(space, at + steps * width)
     if beyond.any() and space.model.constraints:
         for k in np.flatnonzero(beyond.any(axis=1)).tolist():
             limits = Constraints.at(space, at[k, 0], width)
@@ -172,7 +172,7 @@ def candidates(
     for _ in range(_SHORTENINGS):
         if not beyond.any():
             break
-        beyond[beyond] = _infeasible(space, (at + steps * width)[beyond])
+        beyond[beyond] = infeasible(space, (at + steps * width)[beyond])
         steps[beyond] *= _SHORTER
     coordinates = np.clip(at + steps * width, lower, upper)
     changes = steps @ np.swapaxes(root, 1, 2)
@@ -292,7 +292,7 @@ def _kept(
 ) -> Candidates:
     """Of coordinates (n, n_free) those that may be simulated, in the place of an offer's."""
     kept = np.flatnonzero(np.isfinite(coordinates).all(axis=1))
-    kept = kept[~_infeasible(space, coordinates[kept])]
+    kept = kept[~infeasible(space, coordinates[kept])]
     return replace(offer, coordinates=coordinates[kept], damping=damping[kept], undamped=False)
 
 
@@ -301,7 +301,7 @@ def heavier(damping: float) -> float:
     return float(np.clip(damping * _FACTORS[-1] / _FACTORS[0], _LEAST_DAMPING, _MOST_DAMPING))
 
 
-def _infeasible(space: SearchSpace, coordinates: FloatArray) -> BoolArray:
+def infeasible(space: SearchSpace, coordinates: FloatArray) -> BoolArray:
     """Which coordinates (..., n_free) violate a constraint or a physical limit, (...)."""
     violations = space.violations(space.decode(coordinates.reshape(-1, coordinates.shape[-1])))
     infeasible: BoolArray = np.any(violations > 0.0, axis=1).reshape(coordinates.shape[:-1])

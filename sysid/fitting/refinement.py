@@ -200,7 +200,7 @@ def simulations_per_iteration(objective: Objective) -> int:
 def curvature(objective: Objective, at: FloatArray) -> FloatArray:
     """Gauss-Newton Hessian of the error at coordinates (n_free,), in parts of the ranges."""
     descents, objective = _ready(objective, [Descent(Point(at))]), objective.coarse
-    (around,) = _linearised(objective, descents)
+    (around,) = linearised(objective, descents)
     floor = FLOORS[0] * float(objective.error_of(around.rms[None])[0])
     return Quadratic.at(objective, around, floor).hessian
 
@@ -223,7 +223,7 @@ def advance(objective: Objective, descents: Sequence[Descent]) -> list[Descent]:
 def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:
     """The descents, whose integration steps are chosen, after one iteration."""
     space = objective.space
-    around = _linearised(objective, descents)
+    around = linearised(objective, descents)
     surveys = _side_by_side(objective, _surveyed, [*zip(descents, around, strict=True)])
     onward = [descent for descent, _ in surveys]
     quadratics = {i: quadratic for i, (_, quadratic) in enumerate(surveys) if quadratic}
@@ -407,7 +407,7 @@ def _distance(space: SearchSpace, descent: Descent) -> FloatArray:
     return distance
 
 
-def _linearised(objective: Objective, descents: list[Descent]) -> list[Linearisation]:
+def linearised(objective: Objective, descents: Sequence[Descent]) -> list[Linearisation]:
     """Residuals and slopes where descents stand, by their steps."""
     space = objective.space
     if not objective.exact_slopes:
@@ -464,7 +464,7 @@ def _tethered(objective: Objective, descent: Descent, slopes: Slopes) -> Slopes:
 
 
 def _responses(
-    objective: Objective, descents: list[Descent], rows: list[FloatArray], *, keep: bool = True
+    objective: Objective, descents: Sequence[Descent], rows: list[FloatArray], *, keep: bool = True
 ) -> list[Responses]:
     """Responses of each descent's rows of coordinates, by its steps, all in one batch."""
     if not descents:

@@ -12,6 +12,7 @@ from sysid.fitting.descent import Descent, Point
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import beside, corrected, errors_of, refine_each
 from sysid.problem.model import ModelError
+from sysid.problem.space import SearchSpace
 from sysid.uncertainty.covariance import Covariance, covariance
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.quantities import Coordinate, Profiled
@@ -144,17 +145,13 @@ def traced(
 
 
 class _Base:
-    """The estimate that profiles are around, and what is known there for all fits.
-
-    least: its errors by integration steps; those that are met are added.
-    """
+    """The estimate that profiles are around, and what is known there for all fits."""
 
     def __init__(self, tracer: "Tracer") -> None:
-        self.objective, self.estimate = tracer.objective, tracer.local.chromosome
-        self.least: dict[tuple[int, ...], float] = {}
-        self.corrected = corrected(self.objective, self.estimate)
+        self.objective, self.error_by = tracer.objective, tracer.local.error_by
+        self.corrected = corrected(self.objective, tracer.local.chromosome)
         shift = None if self.corrected is None else self.corrected.shift
-        self.error = None if shift is None else self._error(shift.steps)
+        self.error = None if shift is None else self.error_by(shift.steps)
 
     def fitted(self, tasks: Sequence[tuple["Tracer", Wanted]]) -> list[Fit]:
         """The best fits to places, of tracers around the estimate."""
@@ -165,18 +162,11 @@ class _Base:
         worse = [max(end.error for end in ended) for ended in each]
         fits = []
         for (tracer, wanted), end, worst in zip(tasks, ends, worse, strict=True):
-            loss = end.error - (self._error(end.steps) if np.isfinite(end.error) else 0.0)
+            loss = end.error - (self.error_by(end.steps) if np.isfinite(end.error) else 0.0)
             at = objective.space.encode(end.chromosome)
             alone = tracer.statistic(worst - end.error) > Z95**2
             fits.append(Fit(wanted.place, tracer.statistic(loss), at, loss, alone))
         return fits
-
-    def _error(self, steps: tuple[int, ...]) -> float:
-        """Of the estimate, by integration steps."""
-        if steps not in self.least:
-            rms = self.objective.residuals(self.estimate[None], steps, keep=False).rms
-            self.least[steps] = float(self.objective.error_of(rms)[0])
-        return self.least[steps]
 
     def _offered(self, tracer: "Tracer", place: float, at: FloatArray) -> Descent:
         descent = beside(self.objective.space, tracer.begun(place, at), self.corrected)
@@ -332,11 +322,13 @@ class Tracer:
         """A descent to a place from search coordinates (n_free,), or the nearest possible."""
         space = self.objective.space
         restriction = self.quantity.kept(place, self.stiffness)
-        # An open end is no reason to begin where nothing can be simulated.
-        far = _BEYOND * space.width
-        near = np.clip(at, space.coded_lower - far, space.coded_lower + space.width + far)
+        near = np.clip(at, *searched_bounds(space))
         point = Point(np.clip(near, *restriction.bounds(space)))
         return Descent(point, tolerance=self.tolerance, restriction=restriction)
+
+    def is_searched(self, place: float) -> bool:
+        """Whether a place is between the ends of what is searched."""
+        return self._end(-1.0) <= place <= self._end(1.0)
 
     def _end(self, sign: float) -> float:
         """The end of the range on one side, or where the search for one ends."""
@@ -363,6 +355,16 @@ class Tracer:
         straight = nodes[0].at + (place - nodes[0].place) * self.direction
         led = [_led(place, nodes[:n]) for n in (2, 3) if len(nodes) >= n]
         return (nodes[0].at, straight, *led)
+
+
+def searched_bounds(space: SearchSpace) -> tuple[FloatArray, FloatArray]:
+    """Search coordinates (n_free,) between which anything is searched.
+
+    An open end is no reason to go where nothing can be simulated.
+    """
+    (lower, upper), far = space.coded_bounds, _BEYOND * space.width
+    farthest = space.coded_lower + space.width + far
+    return np.maximum(lower, space.coded_lower - far), np.minimum(upper, farthest)
 
 
 def _led(place: float, nodes: Sequence[Fit]) -> FloatArray:

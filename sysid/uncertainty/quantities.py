@@ -9,7 +9,7 @@ from sysid.arrays import FloatArray
 from sysid.fitting.descent import Restriction
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.estimate import Invariant
-from sysid.uncertainty.ties import named_columns
+from sysid.uncertainty.ties import free_gradient, named_columns, named_values
 
 
 class Profiled(Protocol):
@@ -23,6 +23,9 @@ class Profiled(Protocol):
 
     def at(self, coded: FloatArray) -> float:
         """Its place on that scale at search coordinates (n_free,)."""
+
+    def slope(self, coded: FloatArray) -> FloatArray:
+        """Its changes with search coordinates, (n_free,), at such (n_free,)."""
 
     def value(self, place: float) -> float:
         """Its value at a place."""
@@ -46,6 +49,12 @@ class Coordinate:
     def at(self, coded: FloatArray) -> float:
         """The search coordinate."""
         return float(coded[self._index])
+
+    def slope(self, coded: FloatArray) -> FloatArray:
+        """One of the search coordinate itself."""
+        slope = np.zeros(len(coded))
+        slope[self._index] = 1.0
+        return slope
 
     def value(self, place: float) -> float:
         """The parameter."""
@@ -76,6 +85,14 @@ class Expression:
     def at(self, coded: FloatArray) -> float:
         """The expression's value, or its logarithm."""
         return float(self._places(self._space.decode(coded[None]))[0])
+
+    def slope(self, coded: FloatArray) -> FloatArray:
+        """By the parameters that are in it, and those tied to them."""
+        chromosome = self._space.decode(coded)
+        values = named_values(self._space, chromosome)
+        slope = free_gradient(self._combination, self._space, values)
+        slope *= np.where(self._space.log, chromosome, 1.0)
+        return slope / self._combination.value(values) if self._log else slope
 
     def value(self, place: float) -> float:
         """The expression's value."""

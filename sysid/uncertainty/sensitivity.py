@@ -74,6 +74,17 @@ class Sensitivity:
         """What the criterion is at the chromosome."""
         return float(self.criterion.evaluate(self.chromosome[None])[0][0])
 
+    def error_by(self, steps: tuple[int, ...]) -> float:
+        """The same by other integration steps per sample, of each record."""
+        if steps not in self._errors:
+            rms = self.criterion.residuals(self.chromosome[None], steps, keep=False).rms
+            self._errors[steps] = float(self.criterion.error_of(rms)[0])
+        return self._errors[steps]
+
+    @cached_property
+    def _errors(self) -> dict[tuple[int, ...], float]:
+        return {}
+
     @cached_property
     def explains_little(self) -> bool:
         """As of the criterion's ``explains_little``."""

@@ -115,7 +115,7 @@ class SimulatedEnds:
         points = np.stack([ends[i].point for i in batch])
         criterion, space = self.local.criterion, self.local.objective.space
         responses = criterion.residuals(space.decode(points), self.local.steps)
-        losses = criterion.error_of(responses.rms) - self._error
+        losses = criterion.error_of(responses.rms) - self.local.error_by(tuple(self.local.steps))
         onward = []
         for i, loss, values in zip(batch, losses, np.moveaxis(responses.values, 2, 0), strict=True):
             end, tracer = ends[i], tracers[ends[i].place]
@@ -169,14 +169,6 @@ class SimulatedEnds:
         mu = _RESTORING * float(np.diag(hessian).max())
         inverse: FloatArray = np.linalg.inv(hessian + mu * np.eye(n_free)).astype(np.float64)
         return inverse
-
-    @cached_property
-    def _error(self) -> float:
-        """Of the estimate, by the same steps as of the ends."""
-        rms = self.local.criterion.residuals(
-            self.local.chromosome[None], self.local.steps, keep=False
-        ).rms
-        return float(self.local.criterion.error_of(rms)[0])
 
     def _along(self, tracer: Tracer) -> FloatArray:
         along: FloatArray = self.covariance.curvature @ tracer.gradient
