@@ -29,6 +29,8 @@ _RAISED = 0.02 * 4.0 ** np.arange(12)
 _CHANCE_OF_SHOWN = 3.0  # deviations times the root of the samples of a variance by differences
 _SMALL = 0.1  # part of that noise to which a filter answers in proportion, kinks aside
 _TINY = 1e-300
+# Times what the accuracy allows, that a simulation may err by to be compared with another.
+_COMPARABLE = 10.0
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,17 @@ class Sensitivity:
         return float(self.criterion.evaluate(self.chromosome[None])[0][0])
 
     def error_by(self, steps: tuple[int, ...]) -> float:
-        """The same by other integration steps per sample, of each record."""
+        """The same by other integration steps per sample, of each record.
+
+        Where those are far too few here, by more steps: elsewhere they may do.
+        """
         if steps not in self._errors:
-            rms = self.criterion.residuals(self.chromosome[None], steps, keep=False).rms
-            self._errors[steps] = float(self.criterion.error_of(rms)[0])
+            here = self.criterion.residuals(self.chromosome[None], steps, keep=False)
+            enough = tuple(max(pair) for pair in zip(steps, self.steps, strict=True))
+            if here.excess[0] <= _COMPARABLE or enough == steps:
+                self._errors[steps] = float(self.criterion.error_of(here.rms)[0])
+            else:
+                self._errors[steps] = self.error_by(enough)
         return self._errors[steps]
 
     @cached_property

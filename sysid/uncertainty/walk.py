@@ -85,8 +85,8 @@ class Walk:
     @classmethod
     def begun(cls, tracer: Tracer, sign: float, fit: Fit | None = None) -> Self:
         """A walk from the estimate, or a fit on its way."""
-        at = tracer.start if fit is None else fit.at
-        return cls(tracer, sign, at, tuple(tracer.local.steps), Z95 * tracer.unit)
+        at, fits = (tracer.start, ()) if fit is None else (fit.at, (fit,))
+        return cls(tracer, sign, at, tuple(tracer.local.steps), Z95 * tracer.unit, fits=fits)
 
     @property
     def goes_on(self) -> bool:

@@ -739,8 +739,28 @@ class Laddered(Formula):
         return outputs
 
 
-@pytest.mark.parametrize("share", [-0.5, 0.5])
-def test_errors_of_the_integration_steps_are_no_loss_of_likelihood(share):
+class Stiff(Laddered):
+    """The same, but that nothing below the gain can be simulated by one step."""
+
+    def trajectories(self, vectors, record, n_steps=None, starts=None):
+        outputs = Formula.trajectories(self, vectors, record, n_steps, starts)
+        outputs[self._fails(vectors, n_steps)] = np.inf
+        return outputs
+
+    def residuals(self, vectors, records, scales, n_steps, starts, *, keep=True):
+        found = super().residuals(vectors, records, scales, n_steps, starts, keep=keep)
+        excess = np.where(self._fails(vectors, n_steps[:, 0])[:, None], np.inf, found.excess)
+        return replace(found, excess=excess)
+
+    def _fails(self, vectors, n_steps):
+        return (n_steps == 1) & (vectors[:, 0] <= self.above)
+
+
+@pytest.mark.parametrize(
+    ("kind", "share"), [(Laddered, -0.5), (Laddered, 0.5), (Stiff, 0.5)], ids=str
+)
+def test_errors_of_the_integration_steps_are_no_loss_of_likelihood(kind, share):
+    """Nor is what a place gains by which the estimate would fail by its steps."""
     rng = np.random.default_rng(5)
     u = rng.standard_normal((400, 1))
     noise = rng.standard_normal((400, 1))
@@ -750,7 +770,7 @@ def test_errors_of_the_integration_steps_are_no_loss_of_likelihood(share):
         derivative=lambda x, u, p: (p[0] * u[0] - x[0],),
     )
     deviation = float(np.sqrt(np.mean(noise**2) / np.sum(u**2)))
-    simulator = Laddered(model, lambda p, u: p["gain"] * u, 2.0 + share * deviation, noise)
+    simulator = kind(model, lambda p, u: p["gain"] * u, 2.0 + share * deviation, noise)
     record = Dataset(u, 2.0 * u + noise, 0.01)
     objective = Objective(simulator, SearchSpace.of(model), [record])
     ends = profile(objective, np.array([2.0]), "gain")
