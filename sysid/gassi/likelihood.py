@@ -200,8 +200,11 @@ def _centred(optimum: Optimum) -> Optimum:
     return _moved(optimum, centred(optimum.objective, optimum.chromosome))
 
 
-def _moved(optimum: Optimum, end: Refinement | None) -> Optimum:
-    return optimum if end is None else Optimum.of(optimum.objective, end.chromosome, end.rms)
+def _moved(optimum: Optimum, chromosome: FloatArray | None) -> Optimum:
+    if chromosome is None:
+        return optimum
+    rms = optimum.objective.rms(chromosome[None])[0]
+    return Optimum.of(optimum.objective, chromosome, rms)
 
 
 def _explored(
@@ -431,8 +434,8 @@ def _fine_enough(objective: Objective, ends: Sequence[Refinement]) -> Objective:
 
 def _inside(objective: Objective, chromosome: FloatArray) -> FloatArray:
     """A minimum (n_free,) at no end of a range that only ties reach."""
-    end = slid(objective, chromosome)
-    return chromosome if end is None else end.chromosome
+    inside = slid(objective, chromosome)
+    return chromosome if inside is None else inside
 
 
 def _exact_among(first: Optimum, starts: Sequence[FloatArray]) -> Optimum | None:

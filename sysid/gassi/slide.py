@@ -8,17 +8,19 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.objective import Objective
-from sysid.fitting.refinement import Refinement, refine
+from sysid.fitting.refinement import refine
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.sensitivity import sensitivity
-from sysid.uncertainty.ties import Ties, ties
+from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
 
 _HALVINGS = 4  # of a slide that a curved tie does not allow
 _ITERATIONS = 15  # back onto a curved tie
+_CORRECTIONS = 6  # back to the combinations that outputs show
 _WORSE, _NO_BETTER = 1e-5, 1e-6  # shares of the error
+_TINY = 1e-300
 
 
-def slid(objective: Objective, chromosome: FloatArray) -> Refinement | None:
+def slid(objective: Objective, chromosome: FloatArray) -> FloatArray | None:
     """The minimum (n_free,) of an error, slid inside; None where no end is left by that."""
     on_end = objective.space.on_bound(chromosome)
     if not on_end.any():
@@ -28,7 +30,7 @@ def slid(objective: Objective, chromosome: FloatArray) -> Refinement | None:
     return _slid(objective, chromosome, tied, on_end) if on_end.any() else None
 
 
-def centred(objective: Objective, chromosome: FloatArray) -> Refinement | None:
+def centred(objective: Objective, chromosome: FloatArray) -> FloatArray | None:
     """The minimum (n_free,) in the middle of its ties; None where nothing is tied.
 
     From there descents lead along other valleys without an end of a range that only ties reach.
@@ -40,23 +42,48 @@ def centred(objective: Objective, chromosome: FloatArray) -> Refinement | None:
 
 def _slid(
     objective: Objective, chromosome: FloatArray, tied: Ties, on_end: BoolArray
-) -> Refinement | None:
+) -> FloatArray | None:
     """The same, moved along ties, with none of some coordinates (n_free,) on an end any more."""
     space = objective.space
     at = space.encode(chromosome)
     slide = _to_the_middle(space, at, tied.directions)
-    for halving in range(_HALVINGS):
-        start = np.clip(at + 0.5**halving * slide, *space.coded_bounds)
-        end = refine(
-            objective, space.decode(start), max_iterations=_ITERATIONS, tolerance=_NO_BETTER
-        )
+    starts = [
+        np.clip(_corrected(space, tied, at, at + 0.5**halving * slide), *space.coded_bounds)
+        for halving in range(_HALVINGS)
+    ]
+    rows = space.decode(np.stack([at, *starts]))
+    before, *errors = objective.evaluate(rows)[0].tolist()
+    for k, error in enumerate(errors):
+        start: FloatArray = rows[1 + k]
+        if (space.on_bound(start) & on_end).any():
+            continue
+        if error <= (1.0 + _WORSE) * before:
+            return start
+        end = refine(objective, start, max_iterations=_ITERATIONS, tolerance=_NO_BETTER)
         if (space.on_bound(end.chromosome) & on_end).any():
             continue
-        # Both anew: descents end at integration steps of their own.
-        before, after = objective.evaluate(np.stack([chromosome, end.chromosome]))[0]
-        if after <= (1.0 + _WORSE) * before:
-            return end
+        # Anew: descents end at integration steps of their own.
+        if objective.evaluate(end.chromosome[None])[0][0] <= (1.0 + _WORSE) * before:
+            return end.chromosome
     return None
+
+
+def _corrected(space: SearchSpace, tied: Ties, at: FloatArray, moved: FloatArray) -> FloatArray:
+    """Search coordinates (n_free,) moved along a tie, back where its combinations are as before."""
+    if not tied.combinations:
+        return moved
+    target, onward = named_values(space, space.decode(at)), moved
+    for _ in range(_CORRECTIONS):
+        chromosome = space.decode(onward)
+        here = named_values(space, chromosome)
+        left = np.array([change(c, here, target) for c in tied.combinations])
+        slopes = np.stack([free_gradient(c, space, here) for c in tied.combinations])
+        slopes *= np.where(space.log, chromosome, 1.0)
+        size = np.maximum(np.linalg.norm(slopes, axis=1), _TINY)
+        onward = onward + np.linalg.pinv(slopes / size[:, None]) @ (left / size)
+        if not np.isfinite(onward).all():
+            return moved
+    return onward
 
 
 def _to_the_middle(space: SearchSpace, at: FloatArray, directions: FloatArray) -> FloatArray:

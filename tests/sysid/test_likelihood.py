@@ -484,12 +484,29 @@ def test_a_tied_value_is_moved_from_an_end_on_which_only_the_tie_has_left_it():
 def test_a_minimum_is_moved_to_the_middle_of_its_tie_and_stays_one():
     target = objective_of(PRODUCT_LAG, record_of(PRODUCT_LAG, 0.01, noise=0.02))
     minimum = refine(target, np.array([8.0, 0.25, 0.05]))
-    a, b, tau = centred(target, minimum.chromosome).chromosome
+    a, b, tau = centred(target, minimum.chromosome)
     assert a == pytest.approx(b, rel=1e-2)  # both may be 0.1 to 10
     product = minimum.chromosome[0] * minimum.chromosome[1]
     assert (a * b, tau) == pytest.approx((product, minimum.chromosome[2]), rel=1e-3)
     alone = objective_of(lags(), record_of(lags(), 0.01, noise=0.02))
     assert centred(alone, np.array([0.03, 0.12])) is None
+
+
+def test_along_a_tie_that_bends_its_sum_is_kept_and_no_descent_is_needed():
+    """a + b on logarithmic scales: far along it a straight way is no tie any more."""
+    model = replace(
+        PRODUCT_LAG,
+        name="sum lag",
+        derivative=lambda x, u, p: (u[0] - (p[0] + p[1]) * x[0] * p[2],),
+    )
+    target = objective_of(model, record_of(model, 0.01, noise=0.02))
+    end = refine(target, np.array([9.9, 0.4, 0.05])).chromosome
+    before = target.simulations
+    moved = centred(target, end)
+    assert target.simulations - before < 30
+    assert abs(np.log(moved[0] / end[0])) > 0.3
+    assert (moved[0] + moved[1]) * moved[2] == pytest.approx((end[0] + end[1]) * end[2], rel=1e-9)
+    assert target.evaluate(moved[None])[0] == pytest.approx(target.evaluate(end[None])[0], rel=1e-6)
 
 
 def test_a_tied_value_stays_on_an_end_that_the_data_want_it_beyond():
