@@ -23,12 +23,12 @@ from sysid.uncertainty.colour import successive_correlation
 from sysid.uncertainty.covariance import covariance, larger
 from sysid.uncertainty.ends import RangeEnds
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
-from sysid.uncertainty.profile import Fit, Tracer, traced
 from sysid.uncertainty.quantities import Coordinate, Expression
 from sysid.uncertainty.sensitivity import Sensitivity, bend_errors, sensitivity
 from sysid.uncertainty.simulated_ends import SimulatedEnds
 from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
-from sysid.uncertainty.walk import Walk, walked
+from sysid.uncertainty.tracer import Fit, Tracer
+from sysid.uncertainty.walk import Walk, ends_of
 
 # Standard deviation of a logarithm above which the slopes at the estimate are a guide only if
 # simulations agree, and above which they are none.
@@ -246,20 +246,6 @@ def uncertainty(
     joint, simultaneous = analysis.together(intervals)
     moved = analysis.moved_by_bends(intervals) if np.any(result.bent > MISJUDGED) else 0.0
     return replace(result, joint=joint, simultaneous=simultaneous, moved_by_bends=moved)
-
-
-def _ends(walks: Sequence[Walk], fits: list[Fit]) -> list[float | None]:
-    """Ends that walks come to, or where one loses the valley a search from where it was last.
-
-    fits: is given all that were made on the way.
-    """
-    walks = walked(walks)
-    fits += itertools.chain.from_iterable(walk.fits for walk in walks)
-    searches = [
-        (walk.tracer, walk.tracer.bound(walk.sign, walk.last)) for walk in walks if not walk.arrived
-    ]
-    others = iter(traced(searches, fits))
-    return [walk.end if walk.arrived else next(others) for walk in walks]
 
 
 def _with_bottoms(estimate: Estimate, bottoms: Sequence["_Analysis"]) -> Estimate:
@@ -740,7 +726,7 @@ class _Analysis:
             ]
             if not searches:
                 break
-            ends = _ends([Walk.begun(t, sign, begin) for _, t, sign, begin in searches], fits)
+            ends = ends_of([Walk.begun(t, sign, begin) for _, t, sign, begin in searches], fits)
             for (k, _, sign, _), end in zip(searches, ends, strict=True):
                 drafts[k] = drafts[k].with_end(sign, end)
         self.alike = [fit.at for fit in fits if fit.statistic <= Z95**2]

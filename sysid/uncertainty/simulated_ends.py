@@ -24,8 +24,8 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray
 from sysid.uncertainty.covariance import Covariance
 from sysid.uncertainty.estimate import Z95
-from sysid.uncertainty.profile import Tracer
 from sysid.uncertainty.sensitivity import Sensitivity
+from sysid.uncertainty.tracer import Tracer
 
 _SIDES = (-1.0, 1.0)
 _AT_ONCE = 15  # ends that are simulated side by side

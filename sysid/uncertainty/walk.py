@@ -23,6 +23,7 @@ long, as each of them climbs down into the valley from a wall.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +38,7 @@ from sysid.fitting.objective import FLOORS, Linearisation, Objective
 from sysid.fitting.quadratic import Quadratic, infeasible
 from sysid.fitting.refinement import linearised
 from sysid.uncertainty.estimate import Z95
-from sysid.uncertainty.profile import Fit, Tracer, searched_bounds
+from sysid.uncertainty.tracer import Fit, Tracer, searched_bounds, traced
 
 # Steps of a walk, few where a model explains little and none of its minima is the plant's.
 _MOST, _FEW = 30, 10
@@ -161,6 +162,21 @@ class _Outlook:
     @cached_property
     def _hessian(self) -> FloatArray:
         return self.quadratic.hessian
+
+
+def ends_of(walks: Sequence[Walk], fits: list[Fit] | None = None) -> list[float | None]:
+    """Ends that walks come to, or where one loses the valley a search from where it was last.
+
+    None for nowhere. fits: is given all that explain the data on the way.
+    """
+    walks = walked(walks)
+    fits = [] if fits is None else fits
+    fits += itertools.chain.from_iterable(walk.fits for walk in walks)
+    searches = [
+        (walk.tracer, walk.tracer.bound(walk.sign, walk.last)) for walk in walks if not walk.arrived
+    ]
+    others = iter(traced(searches, fits))
+    return [walk.end if walk.arrived else next(others) for walk in walks]
 
 
 def walked(walks: Sequence[Walk]) -> list[Walk]:

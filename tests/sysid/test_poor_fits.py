@@ -1,6 +1,5 @@
 """What a model that explains little costs, and where stiffness is that hangs on starts."""
 
-import importlib
 import math
 
 import numpy as np
@@ -18,10 +17,10 @@ from sysid import (
     State,
 )
 from sysid.fitting.objective import Objective
+
+from sysid.uncertainty import tracer
 from tests.sysid.support import pendulum
 
-# Which the package has a function of the same name for.
-profile = importlib.import_module("sysid.uncertainty.profile")
 DT, SAMPLES = 0.02, 400
 
 
@@ -52,13 +51,13 @@ def test_ends_of_intervals_take_few_fits_where_a_model_explains_little(explained
         angle = BatchSimulator(model).trajectories(model.nominal[None], record)[0, :, 0]
         record = record_of(angle + rng.normal(0.0, 0.01, SAMPLES))
     rounds = []
-    refined = profile.refine_each
+    refined = tracer.refine_each
     monkeypatch.setattr(
-        profile, "refine_each", lambda *args, **kwargs: rounds.append(1) or refined(*args, **kwargs)
+        tracer, "refine_each", lambda *args, **kwargs: rounds.append(1) or refined(*args, **kwargs)
     )
     fitted = GASSI(model, population=100, generations=10, random_state=0).fit(record)
     found = fitted.uncertainty(record)
-    assert len(rounds) <= 3 * profile._FEW
+    assert len(rounds) <= 3 * tracer._FEW
     assert not (explained and rounds), "and none where slopes tell"
     assert [estimate.name for estimate in found.parameters[:3]] == ["inertia", "viscous", "weight"]
 

@@ -41,10 +41,10 @@ from sysid.uncertainty import profile, uncertainty
 from sysid.uncertainty.colour import Autoregression, colour, score_covariance
 from sysid.uncertainty.covariance import covariance
 from sysid.uncertainty.estimate import Z95
-from sysid.uncertainty.profile import Fit, Tracer
 from sysid.uncertainty.quantities import Coordinate
 from sysid.uncertainty.sensitivity import sensitivity
 from sysid.uncertainty.ties import Ties, ties
+from sysid.uncertainty.tracer import Fit, Tracer
 from tests.sysid.support import Formula, lag, linear_response, prbs
 
 Z = 1.959963984540054

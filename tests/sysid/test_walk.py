@@ -11,10 +11,10 @@ from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.uncertainty.covariance import covariance
 from sysid.uncertainty.estimate import Z95
-from sysid.uncertainty.profile import Tracer
 from sysid.uncertainty.quantities import Coordinate
 from sysid.uncertainty.sensitivity import sensitivity
 from sysid.uncertainty.ties import ties
+from sysid.uncertainty.tracer import Tracer
 from sysid.uncertainty.walk import Walk, walked
 from tests.sysid.support import Formula, lag, prbs
 from tests.sysid.test_uncertainty import Problem, columns, unknown
