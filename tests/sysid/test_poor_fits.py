@@ -17,7 +17,6 @@ from sysid import (
     State,
 )
 from sysid.fitting.objective import Objective
-
 from sysid.uncertainty import tracer
 from tests.sysid.support import pendulum
 
