@@ -37,7 +37,8 @@ _PART = 1e-3
 class Covariance:
     """Covariance ``matrix`` (n_free, n_free) of the search coordinates, up to the ties.
 
-    Of what the ties leave alone it is the covariance; of the tied themselves it says nothing.
+    Of what the ``ties`` (n, n_free) leave alone it is the covariance; of the tied themselves it
+    says nothing.
     curvature: what it would be of white residuals of unit weight. newton_step: (n_free,), to
     where slopes and curvature have the minimum, beyond the ends of ranges too. flat: (n, n_free),
     orthonormal, further directions that do not move the outputs, in coordinates times ``sizes``,
@@ -45,6 +46,7 @@ class Covariance:
     falling. spread: between logs, or parts of one, where it is more than chance.
     """
 
+    ties: FloatArray
     matrix: FloatArray
     curvature: FloatArray
     newton_step: FloatArray
@@ -123,6 +125,7 @@ def covariance(
     back = np.divide(back, sizes[:, None], out=np.zeros_like(back), where=sizes[:, None] > 0.0)
     inverse = back @ back.T
     return Covariance(
+        ties,
         inverse @ score @ inverse,
         inverse,
         -inverse @ np.einsum("tip,ti->p", weighted, residual),

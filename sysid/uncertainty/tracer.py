@@ -156,6 +156,7 @@ class Tracer:
         quantity: Profiled,
     ) -> None:
         self.local, self.quantity, self.gradient = local, quantity, gradient
+        self.ties = covariance.ties
         self.start = local.objective.space.encode(local.chromosome)
         self.objective = objective = local.criterion
         self.centre = quantity.at(self.start)

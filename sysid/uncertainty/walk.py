@@ -37,6 +37,7 @@ from sysid.fitting.descent import Descent, Point
 from sysid.fitting.objective import FLOORS, Linearisation, Objective
 from sysid.fitting.quadratic import Quadratic, infeasible
 from sysid.fitting.refinement import linearised
+from sysid.fitting.slopes import triangle_of
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.tracer import Fit, Tracer, searched_bounds, traced
 
@@ -54,10 +55,12 @@ _RESTORING = 10.0 ** -np.array([7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 12.0, 12.0])
 _RESTORING_BY_DIFFERENCES = 10.0 ** -np.array([7.0, 8.0, 8.0, 8.0, 8.0, 8.0])
 # Parts of the most, below which directions lead nowhere.
 _UNFELT, _UNFELT_BY_DIFFERENCES = 1e-9, 1e-5
+_TIED = 1e-9  # part of the largest curvature that ties are given
 _IDLE = 1e-3  # part of a slope in such directions, from which on they move the quantity
 _SETTLED = 0.02  # share of the statistic that a chord takes away, below which more do not matter
 _HOLDINGS = 5  # rounds in which coordinates that go beyond an end of their range are held there
 _AT_END = 1e-6  # parts of a range
+_NO_ROOM = 0.1  # part of a step, below which one at an end of its range does not let it go on
 _WORTH = 0.05  # of the statistic, that a walk goes on for
 _CLOSE = 0.02  # of the way from the estimate, from which the quadratic tells where the end is
 
@@ -219,9 +222,13 @@ def _onward(walks: Sequence[Walk]) -> list[Walk]:
 
 def _further(outlook: _Outlook, fraction: float, at: FloatArray, statistic: float) -> Walk:
     """The walk at a part of the distance, from where it may go farther or less far at once."""
-    walk = outlook.walk
-    whole = max(walk.reach, _LONGER * abs(outlook.distance))
-    reach = whole if fraction == 1.0 else 2.0 * fraction * abs(outlook.distance)
+    walk, distance = outlook.walk, abs(outlook.distance)
+    if fraction == 1.0:
+        reach = max(walk.reach, _LONGER * distance)
+    else:
+        # An end of a range, that let it go on but little, will not be in the way again.
+        cut = distance < _NO_ROOM * min(walk.reach, abs(outlook.whole))
+        reach = walk.reach if cut else 2.0 * fraction * distance
     return replace(walk.moved(at, statistic), reach=reach, count=walk.count + 1)
 
 
@@ -240,13 +247,17 @@ def _seen(walk: Walk, local: Linearisation) -> Walk | _Outlook:
     quadratic = Quadratic.at(tracer.objective, local, FLOORS[0] * error)
     if not quadratic.leads_somewhere:
         return replace(walk, lost=True)
+    if not tracer.objective.exact_slopes:
+        quadratic = _across(quadratic, tracer.ties / space.width)
     low, high = ((ends - walk.at) / space.width for ends in searched_bounds(space))
     slope = tracer.quantity.slope(walk.at) * space.width
     held = np.zeros(len(slope), dtype=bool)
     for _ in range(_HOLDINGS):
         seen = _outlook(walk, local, quadratic, slope, held)
-        ways = seen.back + seen.distance * seen.along
-        beyond = ((low > -_AT_END) & (ways < 0.0)) | ((high < _AT_END) & (ways > 0.0))
+        back = np.clip(seen.back, np.minimum(low, 0.0), np.maximum(high, 0.0))
+        room = _room(seen.distance * seen.along, low - back, high - back)
+        at_end = np.where(seen.distance * seen.along > 0.0, high < _AT_END, low > -_AT_END)
+        beyond = at_end & (room < _NO_ROOM)
         if not np.any(beyond & ~held):
             break
         held = held | beyond
@@ -258,8 +269,7 @@ def _seen(walk: Walk, local: Linearisation) -> Walk | _Outlook:
     if not worth and abs(seen.whole) < _CLOSE * abs(place - tracer.centre):
         end = place + seen.whole
         return replace(here, end=tracer.quantity.value(end) if tracer.is_searched(end) else None)
-    back = np.clip(seen.back, np.minimum(low, 0.0), np.maximum(high, 0.0))
-    distance = seen.distance * _room(seen.distance * seen.along, low - back, high - back)
+    distance = seen.distance * float(np.clip(room.min(), 0.0, 1.0))
     return replace(seen, back=back, distance=distance)
 
 
@@ -310,11 +320,24 @@ def _restoring(tracer: Tracer) -> list[float]:
     return dampings
 
 
-def _room(move: FloatArray, low: FloatArray, high: FloatArray) -> float:
-    """The part of a move (n_free,) that stays between bounds on it."""
+def _room(move: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Parts of a move, (n_free,), that stay between bounds on it."""
     room = np.where(move > 0.0, high, low)
-    shares = np.divide(room, move, out=np.full_like(move, np.inf), where=np.abs(move) > 0.0)
-    return float(np.clip(shares.min(), 0.0, 1.0))
+    return np.divide(room, move, out=np.full_like(move, np.inf), where=np.abs(move) > 0.0)
+
+
+def _across(quadratic: Quadratic, ties: FloatArray) -> Quadratic:
+    """The quadratic that rises a little along ties, (n, n_free) in parts of the ranges.
+
+    Slopes by differences feel them by chance, and would lead far along them for nothing.
+    """
+    if not len(ties):
+        return quadratic
+    n, most = len(quadratic.right), np.sqrt(np.max(np.sum(quadratic.root**2, axis=0)))
+    rows = np.sqrt(_TIED) * most * ties / np.linalg.norm(ties, axis=1, keepdims=True)
+    below = np.zeros((len(rows), 1))
+    triangle = triangle_of(np.block([[quadratic.root, quadratic.right[:, None]], [rows, below]]))
+    return replace(quadratic, root=triangle[:n, :n], right=triangle[:n, n])
 
 
 def _along(root: FloatArray, slope: FloatArray, unfelt: float) -> FloatArray:
