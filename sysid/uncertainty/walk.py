@@ -261,16 +261,30 @@ def _seen(walk: Walk, local: Linearisation) -> Walk | _Outlook:
         if not np.any(beyond & ~held):
             break
         held = held | beyond
-    worth = walk.statistic(error) - seen.after > _WORTH
-    here = replace(walk, arrived=True)
-    if not seen.along.any() and not worth:
-        return here
-    place = tracer.quantity.at(walk.at)
-    if not worth and abs(seen.whole) < _CLOSE * abs(place - tracer.centre):
-        end = place + seen.whole
-        return replace(here, end=tracer.quantity.value(end) if tracer.is_searched(end) else None)
+    if walk.statistic(error) - seen.after <= _WORTH and (ended := _ended(walk, seen)):
+        return ended
     distance = seen.distance * float(np.clip(room.min(), 0.0, 1.0))
     return replace(seen, back=back, distance=distance)
+
+
+def _ended(walk: Walk, seen: _Outlook) -> Walk | None:
+    """A walk on the floor where nothing is left to be gone; None where it goes on.
+
+    It is lost above the level, where no way back is seen, or none to its side of the estimate.
+    """
+    tracer, above = walk.tracer, seen.after > Z95**2
+    if not seen.along.any():
+        return replace(walk, lost=True) if above else replace(walk, arrived=True)
+    if math.isnan(seen.whole):
+        return replace(walk, lost=True)
+    place = tracer.quantity.at(walk.at)
+    if abs(seen.whole) >= _CLOSE * abs(place - tracer.centre):
+        return None
+    end = place + seen.whole
+    if walk.sign * (end - tracer.centre) <= 0.0:
+        return replace(walk, lost=True)
+    value = tracer.quantity.value(end) if tracer.is_searched(end) else None
+    return replace(walk, end=value, arrived=True)
 
 
 def _outlook(
@@ -291,7 +305,7 @@ def _outlook(
     after = walk.statistic(error) - factor * gained
     rising, bent = factor * float(step @ (quadratic.right + change)), factor * float(step @ step)
     whole = _to_level(after, rising, bent, walk.sign)
-    distance = float(np.clip(whole, -walk.reach, walk.reach))
+    distance = 0.0 if math.isnan(whole) else float(np.clip(whole, -walk.reach, walk.reach))
     return _Outlook(
         walk, local, quadratic, slope, held, back, along, whole, distance, after, rising, bent
     )
@@ -304,12 +318,16 @@ def _kept(steps: FloatArray, slope: FloatArray, across: FloatArray) -> FloatArra
 
 
 def _to_level(after: float, rising: float, bent: float, sign: float) -> float:
-    """Distance to where a parabola is at the level on one side, 0 where it is nowhere."""
+    """Distance to where a parabola is at the level on one side, NaN where it is above throughout.
+
+    >>> _to_level(0.0, 0.0, 2.0, -1.0), _to_level(4.0, 0.0, 2.0, 1.0), _to_level(1.0, 0.0, 0.0, 1.0)
+    (-1.959963984540054, nan, inf)
+    """
     root = rising**2 - 2.0 * bent * (after - Z95**2)
-    if root < 0.0:
-        return 0.0
+    if root < 0.0 or (bent <= 0.0 and after > Z95**2):
+        return math.nan
     if bent <= 0.0:
-        return sign * math.inf if after < Z95**2 else 0.0
+        return sign * math.inf
     return (-rising + sign * math.sqrt(root)) / bent
 
 
