@@ -374,7 +374,7 @@ class _Analysis:
         self.pushed = self._pushed_by(Z95)
         self.covariance = self.free
         if self.pushed.any():
-            self.covariance = covariance(local, structure.directions, self.pushed)
+            self.covariance = covariance(local, structure.directions, self.pushed, self.free.score)
         self.gradients: dict[str, FloatArray] = {}
         self.combined: dict[str, Invariant] = {}
         self.alike: list[FloatArray] = []
@@ -617,7 +617,7 @@ class _Analysis:
         def changes(point: FloatArray) -> dict[str, float]:
             return dict(zip(self.gradients, self._changes(point).tolist(), strict=True))
 
-        return RangeEnds(self.local, self.ties.directions, self.on_bound, changes, deviations)
+        return RangeEnds(self.local, self.free, self.on_bound, changes, deviations)
 
     def _is_guide(self, j: int, deviation: float) -> bool:
         """Whether the slopes at the estimate tell how far a parameter may be from it."""

@@ -38,7 +38,7 @@ class Covariance:
     """Covariance ``matrix`` (n_free, n_free) of the search coordinates, up to the ties.
 
     Of what the ``ties`` (n, n_free) leave alone it is the covariance; of the tied themselves it
-    says nothing.
+    says nothing. score: (n_free, n_free), covariance of the error's slope, by which that is.
     curvature: what it would be of white residuals of unit weight. newton_step: (n_free,), to
     where slopes and curvature have the minimum, beyond the ends of ranges too. flat: (n, n_free),
     orthonormal, further directions that do not move the outputs, in coordinates times ``sizes``,
@@ -47,6 +47,7 @@ class Covariance:
     """
 
     ties: FloatArray
+    score: FloatArray
     matrix: FloatArray
     curvature: FloatArray
     newton_step: FloatArray
@@ -91,26 +92,22 @@ class Covariance:
 
 
 def covariance(
-    sensitivity: Sensitivity, ties: FloatArray, held: BoolArray | None = None
+    sensitivity: Sensitivity,
+    ties: FloatArray,
+    held: BoolArray | None = None,
+    score: FloatArray | None = None,
 ) -> Covariance:
     """Covariance at an identified chromosome.
 
     ties: (n, n_free), directions of the coordinates that leave the outputs of any data alone.
-    held: (n_free,), parameters whose value a bound decides.
+    held: (n_free,), parameters whose value a bound decides. score: that of another covariance of
+    the same sensitivity, which simulations need not tell once more.
     """
     residual, slopes = sensitivity.residual, sensitivity.slopes
     weight = sensitivity.objective.least_squares_weights(residual)
     weighted = slopes * weight[:, None]
-    noise = colour(residual, sensitivity.seen, sensitivity.lengths)
-    score = score_covariance(weighted, sensitivity.lengths, noise)
-    # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
-    score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
-    starts = (change for _, change in start_errors(sensitivity))
-    constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
-    for errors in (*constant, averages_errors(sensitivity), bend_errors(sensitivity)):
-        score += _score_covariance_by(weighted, errors)
-    pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, slopes.shape[2])
-    score += pushes.T @ pushes
+    if score is None:
+        score = _score(sensitivity, weight, weighted)
     rows = (slopes * np.sqrt(weight)[:, None]).reshape(-1, slopes.shape[2])
     sizes = np.linalg.norm(rows, axis=0)
     moving = sizes > _ROUNDING**2 * np.max(
@@ -126,6 +123,7 @@ def covariance(
     inverse = back @ back.T
     return Covariance(
         ties,
+        score,
         inverse @ score @ inverse,
         inverse,
         -inverse @ np.einsum("tip,ti->p", weighted, residual),
@@ -134,6 +132,22 @@ def covariance(
         values,
         spread(sensitivity, weighted, back, score),
     )
+
+
+def _score(sensitivity: Sensitivity, weight: FloatArray, weighted: FloatArray) -> FloatArray:
+    """Covariance of the score by all noise, (n_free, n_free); weighted: slopes times weights."""
+    residual = sensitivity.residual
+    noise = colour(residual, sensitivity.seen, sensitivity.lengths)
+    score = score_covariance(weighted, sensitivity.lengths, noise)
+    # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
+    score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
+    starts = (change for _, change in start_errors(sensitivity))
+    constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
+    for errors in (*constant, averages_errors(sensitivity), bend_errors(sensitivity)):
+        score += _score_covariance_by(weighted, errors)
+    pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, weighted.shape[2])
+    score += pushes.T @ pushes
+    return score
 
 
 def _complement(ties: FloatArray, sizes: FloatArray) -> FloatArray:

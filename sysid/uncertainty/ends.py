@@ -25,13 +25,13 @@ _FARTHEST = 30.0  # ranges, beyond which there are no numbers
 class RangeEnds:
     """Ends of ranges on which an estimate stands.
 
-    ties: (n, n_free), directions that leave the outputs alone. on_bound: (n_free,). changes: how
+    free: the covariance with no parameter held. on_bound: (n_free,). changes: how
     far quantities, by name, are at search coordinates (n_free,) from the estimate; deviations:
     standard deviations of these.
     """
 
     local: Sensitivity
-    ties: FloatArray
+    free: Covariance
     on_bound: BoolArray
     changes: Callable[[FloatArray], Mapping[str, float]]
     deviations: Mapping[str, float]
@@ -57,12 +57,9 @@ class RangeEnds:
         combined = [e for e in estimates if e.combination and name in e.combination.names]
         return any(estimate.why == "end" for estimate in combined)
 
-    def opened(self, free: Covariance, estimates: Sequence[Estimate]) -> list[Estimate]:
-        """Estimates without the ends of profiles that these ends of ranges have set.
-
-        free: with no parameter held.
-        """
-        changes = self.changes(self._by_slopes(free))
+    def opened(self, covariance: Covariance, estimates: Sequence[Estimate]) -> list[Estimate]:
+        """Estimates, by a covariance, without the ends of profiles that ends of ranges have set."""
+        changes = self.changes(self._by_slopes(covariance))
         return [self._opened(estimate, changes.get(estimate.name, 0.0)) for estimate in estimates]
 
     def _opened(self, estimate: Estimate, change: float) -> Estimate:
@@ -83,10 +80,10 @@ class RangeEnds:
 
     def _with(self, held: BoolArray) -> Covariance:
         """The covariance with parameters held, (n_free,), which ends the ties that they are in."""
-        ties = self.ties
+        ties = self.free.ties
         if len(ties):
             ties = null_space(ties[:, held].T).T @ ties
-        return covariance(self.local, ties, held)
+        return covariance(self.local, ties, held, self.free.score)
 
     def _moved(self, freed: Sequence[int], passed: Sequence[int]) -> FloatArray | None:
         """Search coordinates, (n_free,), of the minimum by slopes with some parameters freed.
