@@ -61,7 +61,9 @@ _SETTLED = 0.02  # share of the statistic that a chord takes away, below which m
 _HOLDINGS = 5  # rounds in which coordinates that go beyond an end of their range are held there
 _AT_END = 1e-6  # parts of a range
 _NO_ROOM = 0.1  # part of a step, below which one at an end of its range does not let it go on
-_WORTH = 0.05  # of the statistic, that a walk goes on for
+# Of the statistic, that a walk goes on for to begin with, and after some steps: promises are
+# not kept at a kink.
+_WORTH, _SOON, _WORTH_LATER = 0.05, 6, 0.3
 _CLOSE = 0.02  # of the way from the estimate, from which the quadratic tells where the end is
 
 
@@ -261,7 +263,8 @@ def _seen(walk: Walk, local: Linearisation) -> Walk | _Outlook:
         if not np.any(beyond & ~held):
             break
         held = held | beyond
-    if walk.statistic(error) - seen.after <= _WORTH and (ended := _ended(walk, seen)):
+    worth = _WORTH if walk.count < _SOON else _WORTH_LATER
+    if walk.statistic(error) - seen.after <= worth and (ended := _ended(walk, seen)):
         return ended
     distance = seen.distance * float(np.clip(room.min(), 0.0, 1.0))
     return replace(seen, back=back, distance=distance)
