@@ -382,11 +382,16 @@ def _along(root: FloatArray, slope: FloatArray, unfelt: float) -> FloatArray:
 
 
 def _damped_inverse(hessian: FloatArray, damping: float, held: BoolArray) -> FloatArray:
-    """(H + mu I)^-1, (n_free, n_free), of what is not held; damping: mu in parts of the most."""
+    """(H + mu I)^-1, (n_free, n_free), of what is not held; damping: mu in parts of the most.
+
+    Zero where nothing else is felt.
+    """
     left_out = held | held[:, None]
     free = np.where(left_out, 0.0, hessian)
-    damped = free + damping * float(np.diag(free).max()) * np.eye(len(free))
-    return np.where(left_out, 0.0, np.linalg.inv(damped))
+    mu = damping * float(np.diag(free).max())
+    if mu <= 0.0:
+        return np.zeros_like(free)
+    return np.where(left_out, 0.0, np.linalg.inv(free + mu * np.eye(len(free))))
 
 
 def _bends(outlooks: Sequence[_Outlook]) -> list[FloatArray]:

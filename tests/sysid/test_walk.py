@@ -90,6 +90,16 @@ def test_where_a_range_ends_before_there_is_no_end(lower):
     assert above.arrived and above.end is not None
 
 
+def test_from_the_end_of_the_only_range_nothing_leads_on():
+    problem = Problem(lambda p, u: columns(p["k"] * u[:, 0]), [unknown("k", 2.0, lower=1.9)])
+    objective = problem.objective(ranges={"k": (2.1, 20.0)})
+    tracer = tracer_of(objective, 0)
+    assert objective.space.on_bound(tracer.local.chromosome).all()
+    below, above = walked([Walk.begun(tracer, sign) for sign in SIDES])
+    assert below.arrived and below.end is None
+    assert above.arrived
+
+
 @pytest.mark.parametrize("exact", [False, True])
 def test_there_all_else_fitted_anew_is_at_the_level(exact):
     rng = np.random.default_rng(3)
