@@ -210,14 +210,19 @@ def advance(objective: Objective, descents: Sequence[Descent]) -> list[Descent]:
     onward = list(descents)
     live = [i for i, descent in enumerate(descents) if not descent.finished]
     ready, objective = _ready(objective, [descents[i] for i in live]), objective.coarse
-    residuals_each = objective.n_residuals * (1 + len(objective.space.parameters))
-    per_batch = max(1, _BATCH_BYTES // (8 * residuals_each))
-    for first in range(0, len(live), per_batch):
-        batch = slice(first, first + per_batch)
+    most = held_at_once(objective)
+    for first in range(0, len(live), most):
+        batch = slice(first, first + most)
         iterated = _iterated(objective, ready[batch])
         for i, descent in zip(live[batch], iterated, strict=True):
             onward[i] = descent
     return onward
+
+
+def held_at_once(objective: Objective) -> int:
+    """Of how many points residuals and slopes are held at once."""
+    residuals_each = objective.n_residuals * (1 + len(objective.space.parameters))
+    return max(1, _BATCH_BYTES // (8 * residuals_each))
 
 
 def _iterated(objective: Objective, descents: list[Descent]) -> list[Descent]:

@@ -36,14 +36,14 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.descent import Descent, Point
 from sysid.fitting.objective import FLOORS, Linearisation, Objective
 from sysid.fitting.quadratic import Quadratic, infeasible
-from sysid.fitting.refinement import linearised
+from sysid.fitting.refinement import held_at_once, linearised
 from sysid.fitting.slopes import triangle_of
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.tracer import Fit, Tracer, searched_bounds, traced
 
 # Steps of a walk, few where a model explains little and none of its minima is the plant's.
 _MOST, _FEW = 30, 10
-_SIDE_BY_SIDE = 4  # walks whose slopes are held at once
+_SIDE_BY_SIDE = 4  # walks, two tries of each of which are half a block of a simulation
 _PROBE = 0.1  # of a step, which shows how the valley bends
 _FRACTIONS = ((1.0, 0.5), (0.25, 0.1))  # of a step, pairs of which are tried side by side
 _SHORTER, _LONGER = 0.04, 3.0  # the next step's reach, where none of them does and where all did
@@ -188,8 +188,9 @@ def walked(walks: Sequence[Walk]) -> list[Walk]:
     """Walks of quantities around one estimate, side by side, as far as they come."""
     walks = list(walks)
     while live := [i for i, walk in enumerate(walks) if walk.goes_on]:
-        for k in range(0, len(live), _SIDE_BY_SIDE):
-            part = live[k : k + _SIDE_BY_SIDE]
+        most = min(_SIDE_BY_SIDE, held_at_once(walks[0].tracer.objective))
+        for k in range(0, len(live), most):
+            part = live[k : k + most]
             for i, walk in zip(part, _onward([walks[i] for i in part]), strict=True):
                 walks[i] = walk
     return walks
