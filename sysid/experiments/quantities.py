@@ -8,7 +8,7 @@ from sysid.arrays import FloatArray
 from sysid.identifiability import Combination, Identifiability, Term
 from sysid.problem.model import ModelError
 from sysid.problem.space import SearchSpace
-from sysid.uncertainty.ties import free_gradient, named_values
+from sysid.uncertainty.ties import coded_gradient, named_values
 
 
 def determined(structure: Identifiability, space: SearchSpace) -> tuple[Combination, ...]:
@@ -62,8 +62,5 @@ def relative_gradients(
 
 
 def _relative(quantity: Combination, space: SearchSpace, chromosome: FloatArray) -> FloatArray:
-    values = named_values(space, chromosome)
-    increments = np.where(space.log, chromosome, 1.0)
-    value = quantity.value(values)
-    gradient: FloatArray = free_gradient(quantity, space, values) * increments / value
-    return gradient
+    value = quantity.value(named_values(space, chromosome))
+    return coded_gradient(quantity, space, chromosome) / value

@@ -98,6 +98,17 @@ class Quadratic:
         """H, (n_free, n_free)."""
         return self.root.T @ self.root
 
+    def push(self, slopes: Slopes, errors: Callable[[int], FloatArray], count: int) -> FloatArray:
+        """sum_j c_j J_j' e_j of so many points, (count, n_free).
+
+        errors: (count, n_residuals), e of an output by its place.
+        """
+        pushes = np.zeros((count, len(self.right)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for j in np.flatnonzero(self.factors > 0.0).tolist():
+                pushes += self.factors[j] * slopes.pushes(errors(j), j)
+        return pushes
+
     @property
     def leads_somewhere(self) -> bool:
         """Whether it is finite and not flat; slopes at the edge of stability may overflow."""
@@ -276,12 +287,9 @@ def _led(
 ) -> FloatArray:
     """Steps b of free coordinates with (H + added) b = -sum_j c_j J_j' e_j, (n, n_free) each.
 
-    errors: (n, n_residuals), e of an output by its place.
+    errors: as of ``Quadratic.push``.
     """
-    pushes = np.zeros(free.shape)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for j in np.flatnonzero(quadratic.factors > 0.0).tolist():
-            pushes += quadratic.factors[j] * slopes.pushes(errors(j), j)
+    pushes = quadratic.push(slopes, errors, len(free))
     triangles = _triangles(quadratic.root[None], added, ~free)
     halves = _solved(np.swapaxes(triangles, 1, 2), np.where(free, -pushes, 0.0))
     return _solved(triangles, halves)

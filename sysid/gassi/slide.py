@@ -11,7 +11,7 @@ from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.sensitivity import sensitivity
-from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
+from sysid.uncertainty.ties import Ties, change, coded_gradient, named_values, ties
 
 _HALVINGS = 4  # of a slide that a curved tie does not allow
 _ITERATIONS = 15  # back onto a curved tie
@@ -77,8 +77,7 @@ def _corrected(space: SearchSpace, tied: Ties, at: FloatArray, moved: FloatArray
         chromosome = space.decode(onward)
         here = named_values(space, chromosome)
         left = np.array([change(c, here, target) for c in tied.combinations])
-        slopes = np.stack([free_gradient(c, space, here) for c in tied.combinations])
-        slopes *= np.where(space.log, chromosome, 1.0)
+        slopes = np.stack([coded_gradient(c, space, chromosome) for c in tied.combinations])
         size = np.maximum(np.linalg.norm(slopes, axis=1), _TINY)
         onward = onward + np.linalg.pinv(slopes / size[:, None]) @ (left / size)
         if not np.isfinite(onward).all():

@@ -55,7 +55,7 @@ from sysid.uncertainty.sensitivity import (
     sensitivity,
     spans,
 )
-from sysid.uncertainty.ties import free_gradient, named_values
+from sysid.uncertainty.ties import coded_gradient
 
 _LOG_CHANCE = np.log(1e-3)  # of the probability of a finding by chance, all tests together
 # Have no single amplitude.
@@ -578,10 +578,8 @@ def _with_reach(term: AddedTerm, size: float) -> AddedTerm:
 def _gradient(local: Sensitivity, estimate: Estimate) -> FloatArray:
     """Change of a quantity with each coordinate of the slopes, (n_free,)."""
     space = local.objective.space
-    if estimate.combination is None:
-        by_parameters = np.eye(len(space.names))[space.names.index(estimate.name)]
-    else:
-        values = named_values(space, local.chromosome)
-        by_parameters = free_gradient(estimate.combination, space, values)
+    if estimate.combination is not None:
+        return coded_gradient(estimate.combination, space, local.chromosome)
+    by_parameters = np.eye(len(space.names))[space.names.index(estimate.name)]
     gradient: FloatArray = by_parameters * local.increments
     return gradient

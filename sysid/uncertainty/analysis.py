@@ -26,7 +26,7 @@ from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.quantities import Coordinate, Expression
 from sysid.uncertainty.sensitivity import Sensitivity, bend_errors, sensitivity
 from sysid.uncertainty.simulated_ends import SimulatedEnds
-from sysid.uncertainty.ties import Ties, change, free_gradient, named_values, ties
+from sysid.uncertainty.ties import Ties, change, coded_gradient, named_values, ties
 from sysid.uncertainty.tracer import Fit, Tracer
 from sysid.uncertainty.walk import Walk, ends_of
 
@@ -648,7 +648,7 @@ class _Analysis:
         """Estimate of a combination of tied parameters."""
         text, value = combination.text, float(combination.value(self.named))
         estimate = Estimate(text, combination.unit, value, combination=combination)
-        gradient = free_gradient(combination, self.space, self.named) * self.local.increments
+        gradient = coded_gradient(combination, self.space, self.chromosome)
         self.gradients[text], self.combined[text] = gradient, combination
         deviation = self.covariance.deviation(gradient)
         positive = bool(np.all(self.space.log[gradient != 0.0])) and value > 0.0

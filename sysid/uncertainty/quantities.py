@@ -9,7 +9,7 @@ from sysid.arrays import FloatArray
 from sysid.fitting.descent import Restriction
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.estimate import Invariant
-from sysid.uncertainty.ties import free_gradient, named_columns, named_values
+from sysid.uncertainty.ties import coded_gradient, named_columns, named_values
 
 
 class Profiled(Protocol):
@@ -89,10 +89,10 @@ class Expression:
     def slope(self, coded: FloatArray) -> FloatArray:
         """By the parameters that are in it, and those tied to them."""
         chromosome = self._space.decode(coded)
-        values = named_values(self._space, chromosome)
-        slope = free_gradient(self._combination, self._space, values)
-        slope *= np.where(self._space.log, chromosome, 1.0)
-        return slope / self._combination.value(values) if self._log else slope
+        slope = coded_gradient(self._combination, self._space, chromosome)
+        if not self._log:
+            return slope
+        return slope / self._combination.value(named_values(self._space, chromosome))
 
     def value(self, place: float) -> float:
         """The expression's value."""

@@ -79,9 +79,8 @@ class Shown:
 
     def __init__(self, ties: Ties, space: SearchSpace, chromosome: FloatArray) -> None:
         self._space, self._here = space, named_values(space, chromosome)
-        increments = np.where(space.log, chromosome, 1.0)
         alone, self._combinations = ~np.array(ties.bound, dtype=bool), ties.combinations
-        gradients = [free_gradient(c, space, self._here) * increments for c in self._combinations]
+        gradients = [coded_gradient(c, space, chromosome) for c in self._combinations]
         rows = np.concatenate([np.eye(len(alone))[alone], *map(np.atleast_2d, gradients)])
         if np.linalg.matrix_rank(rows / _lengths(rows)) + len(ties.directions) < len(alone):
             alone, self._combinations, rows = np.ones_like(alone), (), np.eye(len(alone))
@@ -204,6 +203,14 @@ def free_gradient(
         if source in space.names:
             gradient[space.names.index(source)] += factor * slope
     return gradient
+
+
+def coded_gradient(
+    combination: Invariant, space: SearchSpace, chromosome: FloatArray
+) -> FloatArray:
+    """The same by the search coordinates, at a chromosome, (n_free,) both."""
+    gradient = free_gradient(combination, space, named_values(space, chromosome))
+    return gradient * np.where(space.log, chromosome, 1.0)
 
 
 @dataclass(frozen=True)

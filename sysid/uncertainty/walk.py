@@ -51,8 +51,8 @@ _LEAST_REACH = 1e-4  # deviations
 _ASTRAY, _NEAR = 0.5, 0.05  # roots of the statistic above what is foretold: too many, and few
 # mu of chords, in parts of the largest curvature: across the valley first, and then along it. By
 # differences slopes along it are not known.
-_RESTORING = 10.0 ** -np.array([7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 12.0, 12.0])
-_RESTORING_BY_DIFFERENCES = 10.0 ** -np.array([7.0, 8.0, 8.0, 8.0, 8.0, 8.0])
+_RESTORING = 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12, 1e-12, 1e-12
+_RESTORING_BY_DIFFERENCES = 1e-7, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8
 # Parts of the most, below which directions lead nowhere.
 _UNFELT, _UNFELT_BY_DIFFERENCES = 1e-9, 1e-5
 _TIED = 1e-9  # part of the largest curvature that ties are given
@@ -150,19 +150,12 @@ class _Outlook:
         foretold = max(self.foretold(fraction), 0.0)
         return math.sqrt(max(statistic, 0.0)) - math.sqrt(foretold)
 
-    def push(self, errors: FloatArray) -> FloatArray:
-        """Slopes (n, n_free) of the error by those of outputs (n_residuals, n_outputs, n)."""
-        pushes = np.zeros((errors.shape[2], len(self.slope)))
-        for j in np.flatnonzero(self.quadratic.factors > 0.0).tolist():
-            columns = np.ascontiguousarray(errors[:, j].T)
-            pushes += self.quadratic.factors[j] * self.local.slopes.pushes(columns, j)
-        return pushes
-
-    def chords(self, errors: FloatArray, damping: float) -> FloatArray:
-        """Steps (n, n_free) back to the floor by errors (n_residuals, n_outputs, n)."""
+    def chord(self, errors: FloatArray, damping: float) -> FloatArray:
+        """The step (n_free,) back to the floor by errors (n_residuals, n_outputs)."""
+        slopes = self.local.slopes
+        (push,) = self.quadratic.push(slopes, lambda j: np.ascontiguousarray(errors[None, :, j]), 1)
         inverse = _damped_inverse(self._hessian, damping, self.held)
-        steps: FloatArray = -self.push(errors) @ inverse
-        return _kept(steps, self.slope, inverse @ self.slope)
+        return _kept(-inverse @ push, self.slope, inverse @ self.slope)
 
     @cached_property
     def _hessian(self) -> FloatArray:
@@ -253,10 +246,10 @@ def _seen(walk: Walk, local: Linearisation) -> Walk | _Outlook:
     if not tracer.objective.exact_slopes:
         quadratic = _across(quadratic, tracer.ties / space.width)
     low, high = ((ends - walk.at) / space.width for ends in searched_bounds(space))
-    slope = tracer.quantity.slope(walk.at) * space.width
+    slope, statistic = tracer.quantity.slope(walk.at) * space.width, walk.statistic(error)
     held = np.zeros(len(slope), dtype=bool)
     for _ in range(_HOLDINGS):
-        seen = _outlook(walk, local, quadratic, slope, held)
+        seen = _outlook(walk, statistic, local, quadratic, slope, held)
         back = np.clip(seen.back, np.minimum(low, 0.0), np.maximum(high, 0.0))
         room = _room(seen.distance * seen.along, low - back, high - back)
         at_end = np.where(seen.distance * seen.along > 0.0, high < _AT_END, low > -_AT_END)
@@ -265,7 +258,7 @@ def _seen(walk: Walk, local: Linearisation) -> Walk | _Outlook:
             break
         held = held | beyond
     worth = _WORTH if walk.count < _SOON else _WORTH_LATER
-    if walk.statistic(error) - seen.after <= worth and (ended := _ended(walk, seen)):
+    if statistic - seen.after <= worth and (ended := _ended(walk, seen)):
         return ended
     distance = seen.distance * float(np.clip(room.min(), 0.0, 1.0))
     return replace(seen, back=back, distance=distance)
@@ -292,21 +285,24 @@ def _ended(walk: Walk, seen: _Outlook) -> Walk | None:
 
 
 def _outlook(
-    walk: Walk, local: Linearisation, quadratic: Quadratic, slope: FloatArray, held: BoolArray
+    walk: Walk,
+    statistic: float,
+    local: Linearisation,
+    quadratic: Quadratic,
+    slope: FloatArray,
+    held: BoolArray,
 ) -> _Outlook:
-    """What is seen ahead while some coordinates are held."""
+    """What is seen ahead, of a statistic here, while some coordinates are held."""
     factor, root = walk.tracer.factor, quadratic.root
     free = np.where(held, 0.0, slope)
     exact = walk.tracer.objective.exact_slopes
     unfelt = _UNFELT if exact else _UNFELT_BY_DIFFERENCES
     along = _along(np.where(held, 0.0, root), free, unfelt)
     damped = _damped_inverse(quadratic.hessian, _restoring(walk.tracer)[-1], held)
-    down = -damped @ (root.T @ quadratic.right)
-    back = _kept(down[None], free, damped @ free)[0]
+    back = _kept(-damped @ (root.T @ quadratic.right), free, damped @ free)
     change, step = root @ back, root @ along
     gained = -float(change @ quadratic.right + 0.5 * change @ change)
-    error = float(walk.tracer.objective.error_of(local.rms[None])[0])
-    after = walk.statistic(error) - factor * gained
+    after = statistic - factor * gained
     rising, bent = factor * float(step @ (quadratic.right + change)), factor * float(step @ step)
     whole = _to_level(after, rising, bent, walk.sign)
     distance = 0.0 if math.isnan(whole) else float(np.clip(whole, -walk.reach, walk.reach))
@@ -315,10 +311,10 @@ def _outlook(
     )
 
 
-def _kept(steps: FloatArray, slope: FloatArray, across: FloatArray) -> FloatArray:
-    """Steps (n, n_free) less what moves the quantity of a slope, by moves across the valley."""
+def _kept(step: FloatArray, slope: FloatArray, across: FloatArray) -> FloatArray:
+    """A step (n_free,) less what moves the quantity of a slope, by a move across the valley."""
     moved = float(slope @ across)
-    return steps - np.outer(steps @ slope, across) / moved if moved > 0.0 else steps
+    return step - across * float(slope @ step) / moved if moved > 0.0 else step
 
 
 def _to_level(after: float, rising: float, bent: float, sign: float) -> float:
@@ -335,11 +331,9 @@ def _to_level(after: float, rising: float, bent: float, sign: float) -> float:
     return (-rising + sign * math.sqrt(root)) / bent
 
 
-def _restoring(tracer: Tracer) -> list[float]:
+def _restoring(tracer: Tracer) -> tuple[float, ...]:
     """mu of chords one after the other, and last that of c."""
-    exact = tracer.objective.exact_slopes
-    dampings: list[float] = (_RESTORING if exact else _RESTORING_BY_DIFFERENCES).tolist()
-    return dampings
+    return _RESTORING if tracer.objective.exact_slopes else _RESTORING_BY_DIFFERENCES
 
 
 def _room(move: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
@@ -474,5 +468,5 @@ def _tried(
         statistic = each.outlook.walk.statistic(float(errors[k]))
         each.tried(statistic, float(responses.excess[k]), last=last)
         if not each.settled:
-            chord = each.outlook.chords(responses.values[..., k : k + 1], damping)[0]
+            chord = each.outlook.chord(responses.values[..., k], damping)
             each.point = np.clip(each.point + chord * space.width, *bounds)
