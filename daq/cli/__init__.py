@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from io import TextIOWrapper
 from types import FrameType
 
 from daq.errors import Mistake, RigError, Terminated
@@ -30,6 +31,7 @@ def main() -> None:
     end: BaseException | None = None
     try:
         gc.set_threshold(_BETWEEN_COLLECTIONS)
+        _choose_encodings()
         # Ctrl-C may come while this is imported, too.
         from daq.cli.app import app
 
@@ -54,6 +56,21 @@ def main() -> None:
         if number != signal.SIGINT:
             signal.signal(number, signal.SIG_DFL)
     sys.exit(status)
+
+
+def _choose_encodings() -> None:
+    """Have every sign written: in files and pipes of Windows as UTF-8, where it has none as '?'.
+
+    Python would take the code page of the country there, which has neither rules of tables nor
+    most Greek letters, and end with a UnicodeEncodeError; from 3.15 on it takes UTF-8 (PEP 686).
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if not isinstance(stream, TextIOWrapper):
+            continue  # closed before this program began
+        if sys.platform == "win32" and not stream.isatty():
+            stream.reconfigure(encoding="utf-8")
+        if stream.errors == "strict":
+            stream.reconfigure(errors="replace")
 
 
 def _hear_signals(ended: Sequence[bool], swallowed: list[BaseException]) -> list[int]:

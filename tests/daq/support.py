@@ -34,6 +34,13 @@ EXPERIMENT = {
 RIG_FILE = {"name": "test rig", "backend": "simulated", "options": {"seed": 3}}
 
 
+def file_limit(size):
+    """What makes a disk full for a process: its files grow to so many bytes. Not on Windows."""
+    import resource
+
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
 def on_terminal(words, folder, columns, **variables):
     """What ``rig`` shows on a terminal so wide, without its colours; variables: environment's."""
     import pty  # not on Windows
@@ -129,7 +136,7 @@ def rig(*args, cwd, env=None, timeout=120, report=False, fresh=False, **options)
         cwd=cwd,
         env=environment(**(env or {})),
         capture_output=True,
-        text=True,
+        encoding="utf-8",
         timeout=timeout,
         check=False,
         **options,
@@ -147,7 +154,7 @@ def start_rig(*args, cwd, env=None, **options):
         env=environment(**(env or {})),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        text=True,
+        encoding="utf-8",
         **options,
     )
 

@@ -2,9 +2,9 @@
 
 import json
 import os
-import pty
 import shlex
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -168,8 +168,11 @@ def test_a_plot_that_cannot_be_is_refused(command, loop, plot, known, message):
     assert sorted(folder.iterdir()) == before
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
 @pytest.mark.parametrize("encoding", mostly_soak(["cp1252", "utf-8"]))
 def test_a_terminal_of_80_columns_shows_everything_and_a_sketch(tmp_path, encoding):
+    import pty
+
     master, slave = pty.openpty()
     process = subprocess.Popen(
         [*RIG, "check", "multisine.yaml"], cwd=tmp_path, stdout=slave, stderr=slave,

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pty
 import re
 import shlex
 import shutil
@@ -158,6 +157,8 @@ def on_terminal(args, cwd, answer=None):
     answer: called with the text so far and the process, whenever more has come. Returns status,
     terminal text and standard output.
     """
+    import pty  # not on Windows
+
     master, slave = pty.openpty()
     process = subprocess.Popen(
         [*RIG, *map(str, args)], cwd=cwd, env=environment(TERM="xterm", COLUMNS="120"),

@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import resource
 import signal
 import subprocess
 import sys
@@ -15,6 +14,7 @@ import pytest
 from tests.daq.support import (
     RIG,
     environment,
+    file_limit,
     only_capture,
     record_of,
     rig,
@@ -340,7 +340,7 @@ def test_a_folder_in_which_nothing_can_be_recorded_does_not_stay(tmp_path):
     write_experiment(tmp_path / "e.yaml")
     result = subprocess.run(
         [*RIG, "run", "e.yaml"], cwd=tmp_path, env=environment(), capture_output=True, text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000)),
+        preexec_fn=file_limit(30_000),
         timeout=60, check=False,
     )  # fmt: skip
     assert result.returncode == 1 and "cannot be written: File too large" in result.stderr

@@ -1,7 +1,6 @@
 """Logs: exact to the bit, readable however they were cut, and never a wrong number."""
 
 import math
-import resource
 import sys
 import warnings
 from pathlib import Path
@@ -20,6 +19,7 @@ from daq.logs.table import read_table
 from daq.logs.writer import LogWriter
 from sim_rig.actuator import actuator
 from tests.daq.support import (
+    file_limit,
     install_faulty,
     journal_of,
     only_capture,
@@ -425,6 +425,7 @@ def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):
 # --- the disk is full ---------------------------------------------------------------------
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limit")
 def test_a_full_disk_ends_the_run_safely_with_a_log_that_loads(tmp_path):
     env = install_faulty(tmp_path / "plugin")
     write_experiment(tmp_path / "e.yaml", duration=5)
@@ -435,9 +436,7 @@ def test_a_full_disk_ends_the_run_safely_with_a_log_that_loads(tmp_path):
     # capture keeps for its last words, and for a part of the log.
     limit = 100_000
 
-    def small_disk():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
+    small_disk = file_limit(limit)
     try:
         result = rig(
             "run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, env=env, preexec_fn=small_disk
@@ -463,13 +462,10 @@ def test_a_full_disk_ends_the_run_safely_with_a_log_that_loads(tmp_path):
 
 
 @pytest.mark.soak
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limit")
 def test_a_disk_full_from_the_start_is_no_traceback(tmp_path):
     write_experiment(tmp_path / "e.yaml")
-
-    def no_disk():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
-
-    result = rig("run", "e.yaml", cwd=tmp_path, preexec_fn=no_disk)
+    result = rig("run", "e.yaml", cwd=tmp_path, preexec_fn=file_limit(100))
     assert result.returncode == 1
     assert "cannot be written: File too large" in result.stderr
     assert "Traceback" not in result.stderr

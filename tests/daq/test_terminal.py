@@ -13,7 +13,7 @@ import typer
 from daq.cli.app import app
 from daq.cli.terminal import Volume, output, print_next, watching
 from daq.progress import Note
-from tests.daq.support import environment, forked_rig, rig, write_experiment, write_rig
+from tests.daq.support import RIG, environment, forked_rig, rig, write_experiment, write_rig
 
 GROUPS = typer.main.get_command(app).commands
 COMMANDS = {
@@ -55,6 +55,19 @@ def test_a_quiet_run_says_where_its_results_are_and_no_more(said):
 def test_usually_progress_and_the_next_command_are_told(said):
     assert "Exciting and logging: 400/400 samples" in said[""].stderr
     assert "\nNext: rig identify runs" in said[""].stdout
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252", "latin-1", "utf-8"])
+def test_signs_that_an_encoding_lacks_end_no_command(tmp_path, encoding):
+    """Piped on Windows they are UTF-8, whatever is asked for."""
+    encoding = "utf-8" if sys.platform == "win32" else encoding
+    result = subprocess.run(
+        [*RIG, "models"], cwd=tmp_path, env=environment(PYTHONIOENCODING=encoding),
+        capture_output=True, timeout=60, check=False,
+    )  # fmt: skip
+    rule = "─" if encoding == "utf-8" else "?"
+    assert result.returncode == 0 and result.stderr == b""
+    assert f"\n {9 * rule}" in result.stdout.decode(encoding)
 
 
 def test_a_verbose_run_says_which_files_and_plugins_it_uses(said):
