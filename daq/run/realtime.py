@@ -25,11 +25,12 @@ _LOCK = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: what is touched stays
 _HIGH_PRIORITY_CLASS = 0x80
 _NORMAL_PRIORITY_CLASS = 0x20
 _MAIN = threading.main_thread()
-_CURE = (
+_ALLOW = (
     "allow it to this user with two lines in /etc/security/limits.d/rig.conf, "
     "'@GROUP - rtprio 50' and '@GROUP - memlock unlimited', and log in again; or start it by "
-    "'sudo chrt --fifo 40 rig run ...'; or write 'realtime: prefer' in the rig's file"
+    "'sudo chrt --fifo 40 rig run ...'"
 )
+_PREFER = "write 'realtime: prefer' in the rig's file"
 
 
 class RealTime:
@@ -61,7 +62,8 @@ class RealTime:
             self._lock_memory()
         if wanted == "require" and self.refused:
             missing = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items())
-            problem = f"required, but not granted: {missing}. Cure: {_CURE}"
+            cure = _PREFER if sys.platform == "win32" else f"{_ALLOW}; or {_PREFER}"
+            problem = f"required, but not granted: {missing}. Cure: {cure}"
             raise ConfigError(problem, key="realtime")
 
     def overrun_since(self, returned: float) -> RunError | None:
@@ -157,7 +159,10 @@ class RealTime:
 
     def _raise_class(self) -> None:
         if sys.platform == "win32":
-            kernel = ctypes.windll.kernel32
+            kernel = ctypes.WinDLL("kernel32")
+            # A handle is a pointer, of which an int, ctypes' default, is half.
+            kernel.GetCurrentProcess.restype = ctypes.c_void_p
+            kernel.SetPriorityClass.argtypes = (ctypes.c_void_p, ctypes.c_uint32)
             process = kernel.GetCurrentProcess()
             if not kernel.SetPriorityClass(process, _HIGH_PRIORITY_CLASS):
                 self.refused["scheduler"] = "SetPriorityClass: refused"

@@ -63,7 +63,8 @@ _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of
 class RecordResult:
     """A model's errors on a record; ``simulated``: whether its free run came to the end.
 
-    floor: residuals in parts of what a right model leaves; None where nothing is known of that.
+    floor: residuals in parts of what a right model leaves; noise: in parts of what one leaves whose
+    parameters are known exactly; None where nothing is known of that.
     starts: initial states that were estimated from the record. shared, by_speed: (n_outputs,),
     correlations as of ``shared_errors`` and ``errors_by_speed``; None where they were not tested.
     alone: (n_outputs,), shares as of ``errors_alone``; None of a run that did not come to the end.
@@ -74,6 +75,7 @@ class RecordResult:
     metrics: Metrics
     residuals: ResidualTest
     floor: FloorTest | None = None
+    noise: FloorTest | None = None
     starts: Starts | None = None
     shared: FloatArray | None = None
     by_speed: FloatArray | None = None
@@ -153,6 +155,7 @@ def examine(
         evaluate(record.outputs, simulated),
         residual_test(residual, record.inputs, record.input_noise, systematic=systematic),
         None if expected is None else floor_test(residual, expected),
+        None if expected is None else floor_test(residual, expected.of_exact_parameters),
         starts,
         shared,
         by_speed,
@@ -232,9 +235,9 @@ def _prediction(
 ) -> Statement:
     """How well outputs are predicted."""
     grave, light = list(broken), list[str]()
-    poor, noisy = _poor_fits(model, validation, "on the validation data")
+    poor, excused = _poor_fits(model, validation, "on the validation data")
     grave += poor.values()
-    light += noisy.values()
+    light += excused.values()
     for name, ratio, beyond, at_floor in _validation_errors(model, training, validation):
         if ratio > _HARDLY_WORSE and beyond > _SMALL and not at_floor and name not in poor:
             reasons = grave if ratio > _FAR_WORSE and beyond > _HARDLY_WORSE * _SMALL else light
@@ -245,36 +248,42 @@ def _prediction(
     elif not validation:
         light.append("No data were held back for validation: the errors are those of the fit.")
     if not grave:
-        poor, noisy_there = _poor_fits(model, training, "even on the training data")
+        poor, excused_there = _poor_fits(model, training, "even on the training data")
         grave += poor.values()
-        light += (reason for name, reason in noisy_there.items() if name not in noisy)
+        light += (reason for name, reason in excused_there.items() if name not in excused)
     light += _input_traces(model, validation or training)
     light += _failing_starts((*training, *validation))
-    return Statement.of(grave, light, _praise(model, validation))
+    return Statement.of(grave, light, _praise(model, training, validation))
 
 
 def _poor_fits(
     model: ProcessModel, results: Sequence[RecordResult], where: str
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Reasons by output: what is explained poorly, and that of which only noise is left.
+    """Reasons by output: what is explained poorly, and that for which there is an excuse.
 
-    What comes anew with each sample, and goes with no input, no model explains.
+    What comes anew with each sample, and goes with no input, no model explains; nor does a right
+    one whose parameters are hardly known. Where noise is known and explains all, there is no
+    reason.
     """
-    poor, noisy = dict[str, str](), dict[str, str]()
+    poor, excused = dict[str, str](), dict[str, str]()
     if not results:
-        return poor, noisy
+        return poor, excused
     fits = mean_known([result.metrics.fit for result in results], 0)
-    floor = ~_above_noise(results) & _known(results)
+    noise, floor = (
+        ~above & _known(results) for above in (_above_noise(results), _above_floor(results))
+    )
     white = np.mean([result.residuals.white for result in results], axis=0) > _WHITE
-    noise = white & ~_follows(results).any(axis=1) & (fits > _SOMETHING)
-    for j in np.flatnonzero((fits < FITTED) & ~floor).tolist():
+    whitened = white & ~_follows(results).any(axis=1) & (fits > _SOMETHING)
+    for j in np.flatnonzero((fits < FITTED) & ~noise).tolist():
         name = model.output_names[j]
         reason = f"{name} is explained poorly {where} (fit {fits[j]:.0f} %)"
-        if noise[j]:
-            noisy[name] = f"{reason}, but what is left is white, as a sensor's noise is."
+        if floor[j]:
+            excused[name] = f"{reason}: what it depends on is hardly known."
+        elif whitened[j]:
+            excused[name] = f"{reason}, but what is left is white, as a sensor's noise is."
         else:
             poor[name] = f"{reason}."
-    return poor, noisy
+    return poor, excused
 
 
 def _of_intervals(
@@ -327,7 +336,7 @@ def _validation_errors(
         ratios = validated / trained
         # A fit of 90 % is an error of a tenth of the deviation.
         beyond = (1.0 - fits / 100.0) * np.sqrt(np.maximum(1.0 - 1.0 / ratios**2, 0.0))
-    floor = ~_above_noise(validation) & _known(validation)
+    floor = ~_above_floor(validation) & _known(validation)
     columns = (ratios, beyond)
     values = zip(*(column.tolist() for column in columns), floor.tolist(), strict=True)
     return [(name, *row) for name, row in zip(model.output_names, values, strict=True)]
@@ -341,13 +350,22 @@ def _known(results: Sequence[RecordResult]) -> BoolArray:
     return everywhere
 
 
-def _above_noise(results: Sequence[RecordResult]) -> BoolArray:
+def _above_floor(results: Sequence[RecordResult]) -> BoolArray:
     """Outputs that on some record err by more than a right model would, (n_outputs,)."""
+    return _above(results, [result.floor for result in results])
+
+
+def _above_noise(results: Sequence[RecordResult]) -> BoolArray:
+    """Outputs that on some record err by more than one with exact parameters, (n_outputs,)."""
+    return _above(results, [result.noise for result in results])
+
+
+def _above(results: Sequence[RecordResult], tests: Sequence[FloorTest | None]) -> BoolArray:
     above = np.zeros(len(results[0].metrics.rmse), dtype=bool)
     limit = _BY_CHANCE / len(results)
-    for floor in (result.floor for result in results if result.floor is not None):
+    for test in (test for test in tests if test is not None):
         with np.errstate(invalid="ignore"):
-            above |= (floor.ratio > _ABOVE_NOISE) & (floor.p_value < limit)
+            above |= (test.ratio > _ABOVE_NOISE) & (test.p_value < limit)
     return above
 
 
@@ -407,7 +425,7 @@ def _unexplained(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
     """Reasons: outputs that leave more than noise, by causes that have moved parameters as well."""
     fits = mean_known([result.metrics.fit for result in results], 0)
     shares = np.mean([result.residuals.white for result in results], axis=0)
-    above, calibrated = _above_noise(results), _known(results)
+    above, calibrated = _above_floor(results), _known(results)
     above_rounding = (1.0 - fits / 100.0 > _ROUNDING)[:, None]
     mostly = (_input_correlations(results)[1] > _MOSTLY) & above_rounding
     follows = _follows(results) & (mostly | (_input_parts(results) > _TRACE))
@@ -618,16 +636,23 @@ def _untested(
         )
 
 
-def _praise(model: ProcessModel, validation: Sequence[RecordResult]) -> str:
+def _praise(
+    model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
+) -> str:
     """The reason for good predictions."""
     if not validation:
         return ""
     fit = float(mean_known([result.metrics.fit for result in validation]))
     chance, sizes = _input_correlations(validation)
     traces = sizes[chance < _BY_CHANCE]
-    reason = (
-        f"Data not used in the fit are explained as well as those that were (mean fit {fit:.1f} %)"
-    )
+    worse = [
+        f"{name} errs {ratio:.1f} times as much as in training"
+        for name, ratio, beyond, _ in _validation_errors(model, training, validation)
+        if ratio > _HARDLY_WORSE and beyond > _SMALL
+    ]
+    as_well = "parameters known so well explain them" if worse else "those that were"
+    details = "; ".join([f"mean fit {fit:.1f} %", *worse])
+    reason = f"Data not used in the fit are explained as well as {as_well} ({details})"
     at_noise = _known(validation) & ~_above_noise(validation)
     if at_noise.any():
         names = [n for n, at in zip(model.output_names, at_noise, strict=True) if at]

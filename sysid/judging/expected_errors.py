@@ -39,14 +39,15 @@ class ExpectedErrors:
     the output is not known. chance: (n_outputs,), variance of that variance from one log to the
     next, by the noise of inputs, which a plant passes on slowly or at times. systematic:
     (n_samples, n_outputs, k), errors that go with the inputs, each by one standard deviation of
-    what makes it: directions of the parameters, the sample that a state starts at, the simulation.
-    passed_on: (n_samples, n_outputs), variance by noise of inputs at each sample.
+    what makes it: the sample that a state starts at, the simulation, and last ``n_directions`` of
+    the parameters. passed_on: (n_samples, n_outputs), variance by noise of inputs at each sample.
     """
 
     noise: FloatArray
     chance: FloatArray
     systematic: FloatArray
     passed_on: FloatArray
+    n_directions: int = 0
 
     @property
     def freedom(self) -> FloatArray:
@@ -62,6 +63,12 @@ class ExpectedErrors:
         """Mean square that is to be expected, (n_outputs,); NaN where the noise is not known."""
         variance: FloatArray = self.noise + np.mean(np.sum(self.systematic**2, axis=2), axis=0)
         return variance
+
+    @property
+    def of_exact_parameters(self) -> "ExpectedErrors":
+        """What is left of them where the parameters are known exactly."""
+        rest = self.systematic.shape[2] - self.n_directions
+        return replace(self, systematic=self.systematic[:, :, :rest], n_directions=0)
 
     def evened(self, residual: FloatArray) -> FloatArray:
         """Residuals (n_samples, n_outputs) as large at every sample, were the model right.
@@ -116,19 +123,19 @@ def expected_errors(
 
     n_steps = int(simulator.steps_of_each(vector[None], record, start[None]).max())
     undisturbed = runs(vector[None])[0]
-    systematic = []
-    if covariance is not None:
-        systematic.append(_by_parameters(runs, space, chromosome, covariance))
     fine = simulator.finer(max(_FINER * simulator.accuracy, 1e-12))
     exact = fine.trajectories(vector[None], record, None, start[None])[0]
     error = np.where(np.isfinite(exact), exact - undisturbed, 0.0)
-    systematic.append(error[..., None])
+    systematic = [error[..., None]]
     for i, deviation in _noisy_starts(simulator, record, undisturbed).items():
         moved = start.copy()
         moved[i] += deviation
         run = simulator.trajectories(vector[None], record, n_steps, moved[None])[0]
         change = np.where(np.isfinite(run), run - undisturbed, 0.0)
         systematic.append(change[..., None])
+    directions = np.zeros((*undisturbed.shape, 0))
+    if covariance is not None:
+        directions = _by_parameters(runs, space, chromosome, covariance)
     jitter = _by_jitter(record, lambda given: runs(vector[None], given)[0])
     variance = record.output_noise**2 + jitter
     variance = np.where(variance > 0.0, variance, np.nan)
@@ -136,7 +143,8 @@ def expected_errors(
     if np.any(record.input_noise):
         squares, passed_on = _by_input_noise(runs, vector, record, undisturbed)
         variance, chance = variance + squares.mean(axis=0), squares.var(axis=0, ddof=1)
-    return ExpectedErrors(variance, chance, np.concatenate(systematic, axis=2), passed_on)
+    errors = np.concatenate([*systematic, directions], axis=2)
+    return ExpectedErrors(variance, chance, errors, passed_on, directions.shape[2])
 
 
 def _by_jitter(record: Dataset, run: Run) -> FloatArray:

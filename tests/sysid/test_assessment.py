@@ -255,7 +255,8 @@ def test_an_error_several_times_as_large_may_still_be_a_small_one(size):
 def expected(noise, data, **systematic):
     nothing, none = np.zeros((*data.outputs.shape, 0)), np.zeros(data.outputs.shape)
     errors, passed_on = systematic.get("errors", nothing), systematic.get("passed_on", none)
-    return ExpectedErrors(np.array(noise), np.zeros(len(noise)), errors, passed_on)
+    by_parameters = errors.shape[2]
+    return ExpectedErrors(np.array(noise), np.zeros(len(noise)), errors, passed_on, by_parameters)
 
 
 def test_errors_of_the_noise_alone_are_no_fault_however_large():
@@ -303,6 +304,41 @@ def test_what_the_parameters_own_uncertainty_leaves_of_an_input_is_not_missing_d
 
     assert "follow load" in " ".join(verdict([wrong(1, 0.0)], [wrong(2, 0.0)]).reasons)
     assert verdict([wrong(1, 1.0)], [wrong(2, 1.0)]).trust == "good"
+
+
+def let_by_parameters(size):
+    """The verdict on a model that errs in validation by what its parameters' uncertainty lets it.
+
+    size: of that error of the speed, in parts of its deviation.
+    """
+
+    def examined(seed, part):
+        data = record(seed)
+        by_parameter = np.zeros((N, 2, 1))
+        by_parameter[:, 0, 0] = size * data.inputs[:, 0]
+        noise = NOISE * np.random.default_rng([seed, 2]).standard_normal((N, 2))
+        wrong = noise + part * by_parameter[:, :, 0]
+        floor = expected([NOISE**2, NOISE**2], data, errors=by_parameter)
+        return examine(data, data.outputs - wrong, floor)
+
+    return verdict([examined(1, 0.0)], [examined(2, 1.0)])
+
+
+@pytest.mark.parametrize(
+    ("size", "trust", "reason"),
+    [
+        (0.8, "limited", "speed is explained poorly on the validation data (fit 20 %): what"),
+        (0.2, "good", "Data not used in the fit are explained as well as parameters known so"),
+    ],
+)
+def test_an_error_that_vague_parameters_let_a_model_make_is_one_all_the_same(size, trust, reason):
+    """It speaks against neither structure nor intervals, but predictions are what they are."""
+    given = let_by_parameters(size)
+    (says,) = given.predicted.reasons
+    assert (given.predicted.trust, given.parameters.trust) == (trust, "good")
+    assert says.startswith(reason) and "speed, current down" not in says
+    if trust == "good":
+        assert "; speed errs 3.9 times as much as in training), current down to the noise" in says
 
 
 def test_faults_of_the_data_count_where_they_matter():
