@@ -54,7 +54,7 @@ class ClockedDevice(SimulatedDevice):
         super().start(sample_rate, mode, guard)
         if mode is Mode.OPEN_LOOP:
             path = Path(self.options.started)
-            path.with_suffix(".tmp").write_text(repr(time.monotonic()))
+            path.with_suffix(".tmp").write_text(repr(time.perf_counter()))
             path.with_suffix(".tmp").replace(path)
 '''
 
@@ -124,13 +124,13 @@ def _kill(folder: Path, after: float) -> Kill:
     try:
         started = _first_row(folder, process)
         waits: list[tuple[float, float]] = []
-        while (now := time.monotonic()) < started + after:
+        while (now := time.perf_counter()) < started + after:
             waits.append((now, _waited(process.pid)))
             time.sleep(min(0.05, started + after - now))
         waited = _waited(process.pid)
         _require_running(folder, process)
         os.kill(process.pid, signal.SIGKILL)
-        killed = time.monotonic()
+        killed = time.perf_counter()
     finally:
         process.kill()
         process.wait()
@@ -166,8 +166,8 @@ def _prepare(folder: Path) -> dict[str, str]:
 
 def _first_row(folder: Path, process: subprocess.Popen[bytes]) -> float:
     """When the device was started [monotonic s], once the log holds its first two rows."""
-    deadline = time.monotonic() + _PATIENCE
-    while time.monotonic() < deadline:
+    deadline = time.perf_counter() + _PATIENCE
+    while time.perf_counter() < deadline:
         logs = list((folder / "runs").glob("*/log.csv"))
         if logs and (folder / "started").exists() and logs[0].read_bytes().count(b"\n") > 2:
             return float((folder / "started").read_text())

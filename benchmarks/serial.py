@@ -154,12 +154,12 @@ def over_the_pty(folder: Path, samples: int) -> dict[str, Any]:
     with emulator(folder) as (port, emulator_pid):
         before = _processor_seconds(emulator_pid)
         process = start_run(folder, port, samples)
-        begun, used, memory = time.monotonic(), 0.0, []
+        begun, used, memory = time.perf_counter(), 0.0, []
         while process.poll() is None:
             memory.append((_resident(process.pid), _resident(emulator_pid)))
             used = max(used, _processor_seconds(process.pid))
             time.sleep(1.0)
-        wall = time.monotonic() - begun
+        wall = time.perf_counter() - begun
         emulated = _processor_seconds(emulator_pid) - before
     run = next((folder / "runs").iterdir())
     import pandas  # noqa: F401  # what a program that loads logs has imported by then
@@ -202,8 +202,8 @@ def kills(folder: Path, n: int, seed: int) -> list[float]:
 
 
 def _journal_until(folder: Path, wanted: Any) -> dict[str, Any]:
-    deadline = time.monotonic() + 30.0
-    while time.monotonic() < deadline:
+    deadline = time.perf_counter() + 30.0
+    while time.perf_counter() < deadline:
         lines = (folder / "journal.jsonl").read_text().splitlines()
         for entry in map(json.loads, lines):
             if wanted(entry):

@@ -41,7 +41,7 @@ class Rig:
     offsets: volts that each analog input reads at zero, (3,) in ``ANALOG_INPUTS`` order.
     saturated: samples in which each stood at the end of its converter, (3,). sampling: between
     ``start`` and ``stop``, after ``safe`` as well. call: the method of an open device that has not
-    returned yet, and since when [s] by ``time.monotonic``. Use as a context manager: leaving it,
+    returned yet, and since when [s] by ``time.perf_counter``. Use as a context manager: leaving it,
     by whatever way, zeroes the outputs and closes the device.
     """
 
@@ -53,7 +53,7 @@ class Rig:
         self._scale = np.array([item.sign * item.scale for item in inputs])
         self.sampling = False
         self.call: tuple[str, float] | None = None
-        self.returned = 0.0  # when the last call of the backend ended, by the monotonic clock
+        self.returned = 0.0  # when the last call of the backend ended, by ``time.perf_counter``
         self._unsafe = ""  # why the device could not be told to zero its outputs
         self._device = device
         self._info: DeviceInfo | None = None
@@ -198,11 +198,11 @@ class Rig:
 
     def _timed(self, method: Callable[[*_Arguments], _Result], *args: *_Arguments) -> _Result:
         """What a method of the open device returns; ``call`` says that it is being waited for."""
-        self.call = getattr(method, "__name__", "a method"), time.monotonic()
+        self.call = getattr(method, "__name__", "a method"), time.perf_counter()
         try:
             return call(method, *args)
         finally:
-            self.call, self.returned = None, time.monotonic()
+            self.call, self.returned = None, time.perf_counter()
 
     def _largest_step(self) -> FloatArray | None:
         """Largest change of each command from tick to tick, (2,) [V]; None without a slew limit."""

@@ -163,11 +163,11 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], *PICTURES], metavar="NAME.png")
     for name in parser.parse_args().names or PICTURES:
         with tempfile.TemporaryDirectory() as folder:
-            began = time.monotonic()
+            began = time.perf_counter()
             made = PICTURES[name](Path(folder))
             if made.parent != GALLERY:
                 save(made, IMAGES / name)
-        print(f"{name}: {time.monotonic() - began:.0f} s", flush=True)
+        print(f"{name}: {time.perf_counter() - began:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

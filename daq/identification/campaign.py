@@ -170,9 +170,9 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
         nonlocal written
         outcomes.append(outcome)
         # Not at each of thousands: writing is of all that there is.
-        if time.monotonic() - written > _WRITE_EVERY:
+        if time.perf_counter() - written > _WRITE_EVERY:
             _write_table(folder, Campaign(tuple(outcomes)))
-            written = time.monotonic()
+            written = time.perf_counter()
 
     try:
         result = run_all(groups, seeds, wanted.workers, watch, keep)

@@ -107,7 +107,7 @@ class LogWriter:
 
     def _look(self) -> None:
         """Go on elsewhere if somebody has disturbed the file."""
-        part, now = self._parts[-1], time.monotonic()
+        part, now = self._parts[-1], time.perf_counter()
         if now < self._next_look:
             problem = part.resized()
         else:

@@ -120,7 +120,7 @@ class SignalHandling:
 
     def end_by(self, error: BaseException) -> None:
         """Raise an error that came out of turn, or keep it for later behind the shield."""
-        now = time.monotonic()
+        now = time.perf_counter()
         if not self._shielded or self._breakable:
             self._first = self._first or now
             self._raised, self._pending = (error, self._shielded, self._breakable), None

@@ -134,11 +134,11 @@ class Page:
         if self._tick % _HEAD_EVERY == 0:
             self._show_head()
         self._tick += 1
-        self._sent.start, self._sent_at = self._tick, time.monotonic()
+        self._sent.start, self._sent_at = self._tick, time.perf_counter()
 
     def _browser_is_behind(self) -> bool:
         """Whether the last updates have not been drawn yet: more of them would only queue up."""
-        waiting = time.monotonic() - self._sent_at < _LOST
+        waiting = time.perf_counter() - self._sent_at < _LOST
         return waiting and self._tick - cast("int", self._seen.start) > _AHEAD
 
     def _show(self, log: FollowedLog | None) -> None:

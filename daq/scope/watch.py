@@ -84,7 +84,7 @@ class FollowedLog:
         self._record_version: tuple[int, int] | None = None
         self.tail = LogTail(path)
         self.history: History | None = None
-        self._grew = time.monotonic()
+        self._grew = time.perf_counter()
         self.look()
 
     @property
@@ -113,7 +113,7 @@ class FollowedLog:
             self.history = History(self.tail.columns, self.tail.read_between)
         if self.history is not None and len(values):
             self.history.add(values, starts)
-            self._grew = time.monotonic()
+            self._grew = time.perf_counter()
 
     def look(self) -> None:
         """Read run.json again where it has changed."""
@@ -135,7 +135,7 @@ class FollowedLog:
         texts += [f"{file}: {text}" for text in problems.first]
         if problems.count > len(problems.first):
             texts.append(f"{file}: and {problems.count - len(problems.first)} more like these")
-        quiet = time.monotonic() - self._grew
+        quiet = time.perf_counter() - self._grew
         if self.state.running and quiet > _QUIET and self.n_rows:
             texts.append(
                 f"no new sample for {quiet:.0f} s although the run has not ended: "
@@ -165,7 +165,7 @@ class Watch:
 
     def poll(self) -> None:
         """Look for a newer run, then for new samples."""
-        now = time.monotonic()
+        now = time.perf_counter()
         if now - self._polled < _POLL:
             return
         self._polled = now

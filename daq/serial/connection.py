@@ -75,7 +75,7 @@ class Connection:
     def act(self, action: Callable[[HostMachine, float], T]) -> T:
         """Let the machine act at the present time [s] and send its frames; the action's result."""
         with self._changed:
-            self._last_call = time.monotonic()
+            self._last_call = time.perf_counter()
             result = action(self._machine, self._last_call)
             self._write()
         return result
@@ -101,14 +101,14 @@ class Connection:
         with self._changed:
             if not self._wait(lambda: bool(machine.blocks)) and machine.failure is not None:
                 raise machine.failure
-            self._last_call = time.monotonic()
+            self._last_call = time.perf_counter()
             taken, machine.blocks = machine.blocks, []
         return taken
 
     def go(self) -> None:
         """Start the clock once the device has what was sent ahead."""
         machine = self._machine
-        deadline = time.monotonic() + _PRELOAD_PATIENCE
+        deadline = time.perf_counter() + _PRELOAD_PATIENCE
         preloaded = self._wait(lambda: machine.commands.preloaded, deadline)
         if not preloaded and machine.failure is None:
             raise DeviceError(
@@ -125,10 +125,10 @@ class Connection:
     def check_delay(self) -> None:
         """Measure round trips; raises DeviceError for a line too slow for the watchdog."""
         clock, decoder = self._machine.clock, self._machine.decoder
-        deadline = time.monotonic() + _PING_PATIENCE
+        deadline = time.perf_counter() + _PING_PATIENCE
         for _ in range(_PINGS):
             # A ping that is lost must not use up the time of the others.
-            self._ping(min(deadline, time.monotonic() + _PING_PATIENCE / _PINGS))
+            self._ping(min(deadline, time.perf_counter() + _PING_PATIENCE / _PINGS))
         if clock.quickest <= 0.5 * self._watchdog:
             return
         if not clock.round_trips and decoder.rejected:
@@ -186,7 +186,7 @@ class Connection:
         """Wait for a condition, a failure or a deadline; whether the condition holds."""
         with self._changed:
             while not condition():
-                self._last_call = time.monotonic()
+                self._last_call = time.perf_counter()
                 if self._machine.failure is not None or self._last_call >= deadline:
                     return False
                 self._changed.wait(min(_LOOK, deadline - self._last_call))
@@ -212,7 +212,7 @@ class Connection:
             data = self._link.read()
             if data:
                 with self._changed:
-                    self._machine.feed(data, time.monotonic())
+                    self._machine.feed(data, time.perf_counter())
                     self._write()
                     self._changed.notify_all()
 
@@ -220,7 +220,7 @@ class Connection:
         machine, pause = self._machine, min(_FEED, 0.2 * self._watchdog)
         while not self._leaving.wait(pause) and machine.failure is None:
             with self._changed:
-                now, pending = time.monotonic(), machine.pending
+                now, pending = time.perf_counter(), machine.pending
                 machine.poll(now, keep_alive=now - self._last_call < _PATIENCE)
                 self._write()
                 if machine.failure is not None or machine.pending is not pending:

@@ -1,7 +1,7 @@
 """The host's side of the protocol: sessions, retries, credit, gaps. No I/O, no clock of its own.
 
 A program around it feeds bytes (``feed``), calls ``poll`` every few milliseconds and writes
-what ``take`` gives. Times are seconds of the host's monotonic clock.
+what ``take`` gives. Times are seconds of ``time.perf_counter``.
 """
 
 import itertools

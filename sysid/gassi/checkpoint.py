@@ -68,7 +68,7 @@ class Checkpoint:
     def save(self, state: State) -> None:
         """Keep a state; write it if the last writing was a while ago."""
         self._pending = state
-        if self._written is None or time.monotonic() - self._written >= INTERVAL:
+        if self._written is None or time.perf_counter() - self._written >= INTERVAL:
             self.flush()
 
     def flush(self) -> None:
@@ -93,7 +93,7 @@ class Checkpoint:
                 raise ModelError(problem) from None
             warnings.warn(problem, stacklevel=2)
         self._pending = None
-        self._written = time.monotonic()
+        self._written = time.perf_counter()
 
 
 def load(path: Path, begun_with: Mapping[str, Any]) -> State:

@@ -227,9 +227,9 @@ class Started:
         return self.returncode
 
     def wait(self, timeout=None):
-        deadline = time.monotonic() + (timeout or 1e9)
+        deadline = time.perf_counter() + (timeout or 1e9)
         while self.poll() is None:
-            if time.monotonic() > deadline:
+            if time.perf_counter() > deadline:
                 raise subprocess.TimeoutExpired("rig", timeout)
             time.sleep(0.005)
         return self.returncode
@@ -338,8 +338,8 @@ def forked_rig(**env):
 
 def until(condition, what, seconds=60.0, every=0.005):
     """Poll until ``condition`` gives something true, and return it."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+    deadline = time.perf_counter() + seconds
+    while time.perf_counter() < deadline:
         result = condition()
         if result:
             return result
@@ -421,7 +421,7 @@ class FaultyDevice(SimulatedDevice):
 
     def note(self, what, **facts):
         with self._path.open("a") as journal:
-            journal.write(json.dumps({"what": what, "at": time.monotonic(), **facts}) + "\\n")
+            journal.write(json.dumps({"what": what, "at": time.perf_counter(), **facts}) + "\\n")
 
     def start(self, sample_rate, mode, guard):
         self._exciting = mode is Mode.OPEN_LOOP

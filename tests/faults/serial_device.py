@@ -65,7 +65,7 @@ class SerialBoard:
         self._last = None  # number of the last request, and its REPLY
         self._number = 0  # of SAMPLES and STATUS
         self._buffer = bytearray()
-        self._heard = self._when = time.monotonic()
+        self._heard = self._when = time.perf_counter()
         self._clock = 0.0  # ticks
         self._idle_until = self._when
         self._gone = False  # reset, and nothing more to say of it
@@ -74,7 +74,7 @@ class SerialBoard:
 
     def clock(self):
         """The device's clock [ticks]."""
-        now = time.monotonic()
+        now = time.perf_counter()
         self._clock += (now - self._when) * CLOCK * self.board.now.clock
         self._when = now
         return int(self._clock)
@@ -106,10 +106,10 @@ class SerialBoard:
             if self.clock() < run.begun + run.ticker.tick * run.period:
                 break
             self._tick(run)
-        self._idle_until = time.monotonic()
+        self._idle_until = time.perf_counter()
 
     def _idle(self):
-        now = time.monotonic()
+        now = time.perf_counter()
         while now - self._idle_until >= _IDLE_STEP:
             self._idle_until += _IDLE_STEP
             kept = self._run.ticker.last if self._run and self.board.now.ignores_safe else [0.0] * 2
@@ -146,7 +146,7 @@ class SerialBoard:
             self._send(line.SAMPLES, payload)
 
     def _watch(self, run):
-        silence = time.monotonic() - self._heard
+        silence = time.perf_counter() - self._heard
         if silence > run.watchdog and self._latch != WATCHDOG:
             run.ticker.latch = NONE  # this one outlasts every other
             run.ticker.make_safe(WATCHDOG)
@@ -176,7 +176,7 @@ class SerialBoard:
         if frame.session != self._session:
             self._answer(frame, line.reply(frame.kind, line.NO_SESSION, self._status()))
             return
-        self._heard = time.monotonic()
+        self._heard = time.perf_counter()
         if frame.kind == line.COMMANDS:
             self._commands(frame.payload)
         elif frame.kind == line.PING:
@@ -193,7 +193,7 @@ class SerialBoard:
             self._latch = self._latch if self._latch == WATCHDOG else NONE
             self._session, self._run, self._last = frame.session, None, None
         if frame.session == self._session:
-            self._heard = time.monotonic()
+            self._heard = time.perf_counter()
         watchdog = (_DEFAULT_WATCHDOG, _LONGEST_WATCHDOG)
         payload = line.welcome(self._latch, CLOCK, MAX_RATE, QUEUE, watchdog, _CHANNELS)
         self._send(line.WELCOME, payload, frame)
@@ -304,7 +304,7 @@ class SerialBoard:
         if self._run is not None:
             self._run.ticker.make_safe(SAFE)
             self._run.waiting = []
-        self._state, self._idle_until = IDLE, time.monotonic()
+        self._state, self._idle_until = IDLE, time.perf_counter()
 
     def _status(self):
         run = self._run

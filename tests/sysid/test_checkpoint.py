@@ -246,7 +246,7 @@ def test_a_disk_that_fills_up_later_does_not_lose_the_search(tmp_path, whole, mo
 def test_states_that_follow_at_once_are_not_written_one_by_one(tmp_path, monkeypatch):
     """Writing waits for the disk; the last state is kept until then."""
     clock = [100.0]
-    monkeypatch.setattr("sysid.gassi.checkpoint.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("sysid.gassi.checkpoint.time.perf_counter", lambda: clock[0])
     path = tmp_path / "search"
     keeper = checkpoint.Checkpoint(path, ORIGIN)
     written = []

@@ -134,14 +134,14 @@ class TcpPort:
         if self._listener is not None and self._newcomer is None:
             with contextlib.suppress(BlockingIOError):
                 self._newcomer, _ = self._listener.accept()
-                self._came = time.monotonic()
+                self._came = time.perf_counter()
         if self._newcomer is None:
             return
         if self._host is None:
             self._host, self._newcomer = self._newcomer, None
             self._host.setblocking(False)
             self._host.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        elif time.monotonic() - self._came > _COURTESY:
+        elif time.perf_counter() - self._came > _COURTESY:
             self._newcomer.close()
             self._newcomer = None
 

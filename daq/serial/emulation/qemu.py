@@ -172,14 +172,14 @@ class EmulatedFirmware:
 
     def _opened(self, pipe: Path, mode: int) -> int:
         """Open an end of a pipe, as soon as QEMU has the other."""
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.perf_counter() + _PATIENCE
         while True:
             # A writer finds no reader at first; a reader would not know whether a writer is there.
             try:
                 descriptor = _end_of(pipe, mode)
                 break
             except OSError:
-                if self._process.poll() is not None or time.monotonic() > deadline:
+                if self._process.poll() is not None or time.perf_counter() > deadline:
                     raise self._failure() from None
                 time.sleep(_LOOK)
         self._files.callback(os.close, descriptor)

@@ -212,10 +212,10 @@ def test_a_device_that_cannot_be_worked_with_is_refused_within_three_seconds(
 ):
     with emulate(tmp_path, "--fault", fault) as running:
         device = SerialDevice(SerialOptions(port=running.port))
-        begun = time.monotonic()
+        begun = time.perf_counter()
         with pytest.raises(DeviceError, match=reason):
             device.open()
-        assert time.monotonic() - begun < ANSWERS_WITHIN
+        assert time.perf_counter() - begun < ANSWERS_WITHIN
         device.close()
 
 

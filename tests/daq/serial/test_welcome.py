@@ -83,10 +83,10 @@ LIES = {
 def test_what_cannot_be_is_refused_by_its_name(payload, named):
     with device_that_says(payload) as port:
         device = SerialDevice(SerialOptions(port=port))
-        begun = time.monotonic()
+        begun = time.perf_counter()
         with pytest.raises(DeviceError, match=named):
             device.open()
-        assert time.monotonic() - begun < ANSWERS_WITHIN
+        assert time.perf_counter() - begun < ANSWERS_WITHIN
         device.close()
     assert not [t for t in threading.enumerate() if t.name.startswith("serial rig")]
 

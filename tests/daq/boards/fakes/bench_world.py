@@ -336,4 +336,4 @@ class World:
     def note(self, what, **facts):
         if self.settings.journal:
             with Path(self.settings.journal).open("a") as journal:
-                journal.write(json.dumps({"what": what, "at": time.monotonic(), **facts}) + "\n")
+                journal.write(json.dumps({"what": what, "at": time.perf_counter(), **facts}) + "\n")
