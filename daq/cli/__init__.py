@@ -16,7 +16,7 @@ from daq.errors import Mistake, RigError, Terminated
 from daq.process import signal_main_thread
 
 _INTERRUPTED = 130  # what Typer makes of Ctrl-C
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # where there is such a signal
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # where there is such a signal
 # New objects between two searches for what only refers to itself. By Python's 700 there are
 # hundreds of searches while modules are loaded and figures drawn, in vain.
 _BETWEEN_COLLECTIONS = 50_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import sys
@@ -20,6 +21,10 @@ from daq.process import signal_main_thread
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGQUIT", "SIGTSTP")
 _PATIENCE = 2.0  # s after the first signal in which the outputs must have been zeroed
 _LATER = 0.02  # s until an error that Python swallowed is raised again
+# Of Windows' console: numbers of a closed window, a log-off, a shutdown; and how long [s] it lets a
+# program be after the first, which a system may shorten.
+_CLOSED = {2: "a closed window", 5: "a log-off", 6: "a shutdown"}
+_LAST_SECONDS = 4.5
 
 
 class SignalHandling:
@@ -33,7 +38,8 @@ class SignalHandling:
     behind the shield without an effect is raised at the end. Signals that the process ignores, as
     under nohup, stay ignored. ``interrupt`` raises an error of another thread's as if a signal had
     brought it. What is raised in a destructor or in a callback of the garbage collector's is
-    swallowed by Python; it is raised again once that has returned.
+    swallowed by Python; it is raised again once that has returned. Windows has no signal of a
+    closed window; it is kept from ending the process until ``__exit__``.
     """
 
     def __init__(self) -> None:
@@ -46,6 +52,8 @@ class SignalHandling:
         self._shielded, self._breakable = True, False
         self._raised: tuple[BaseException, bool, bool] | None = None  # by what, and behind what
         self._hook_before: Callable[[sys.UnraisableHookArgs], Any] = sys.unraisablehook
+        self._over = threading.Event()
+        self._console = contextlib.ExitStack()
 
     def __enter__(self) -> SignalHandling:
         self._hook_before, sys.unraisablehook = sys.unraisablehook, self._swallowed
@@ -53,6 +61,7 @@ class SignalHandling:
             numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
             heard = [n for n in numbers if signal.getsignal(n) is not signal.SIG_IGN]
             self._before = [(number, signal.signal(number, self._handle)) for number in heard]
+            self._console.enter_context(_console_events(self._closed))
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
@@ -61,6 +70,8 @@ class SignalHandling:
         for number, handler in reversed(before):  # Ctrl-C last: with its own it raises again
             signal.signal(number, handler)
         sys.unraisablehook = self._hook_before
+        self._over.set()
+        self._console.close()
         if error is None and self._pending is not None:
             raise self._pending
 
@@ -91,6 +102,14 @@ class SignalHandling:
             number = signal.Signals(self._before[0][0])
             self._interruption = error
             signal_main_thread(number)
+
+    def _closed(self, event: int) -> bool:
+        """From a thread of Windows', which ends the process once this has returned true."""
+        if event not in _CLOSED:
+            return False
+        self.interrupt(Terminated(_CLOSED[event]))
+        self._over.wait(_LAST_SECONDS)
+        return True
 
     def _swallowed(self, unraisable: sys.UnraisableHookArgs) -> None:
         """Python's hook for errors that it cannot raise: ours are raised later."""
@@ -138,6 +157,21 @@ class SignalHandling:
             words = f"{reason}\nrig: {self.last_act(status, reason)}"
         os.write(2, f"rig: {words}\n".encode())
         os._exit(1)
+
+
+@contextlib.contextmanager
+def _console_events(handle: Callable[[int], bool]) -> Iterator[None]:
+    """Have Windows tell what happens to the console, by its number, until the end of the block."""
+    if sys.platform != "win32":
+        yield
+        return
+    handler = ctypes.WINFUNCTYPE(ctypes.c_int, ctypes.c_uint32)(handle)
+    kernel = ctypes.WinDLL("kernel32")
+    kernel.SetConsoleCtrlHandler(handler, True)
+    try:
+        yield
+    finally:
+        kernel.SetConsoleCtrlHandler(handler, False)
 
 
 def _within(frame: FrameType | None, code: CodeType) -> bool:

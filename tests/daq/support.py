@@ -148,7 +148,8 @@ def start_rig(*args, cwd, env=None, **options):
     words = _words(args, report=False)
     if not options and hasattr(os, "fork"):
         return _shared_server().start(words, cwd, env)
-    return subprocess.Popen(
+    begin = _Breakable if sys.platform == "win32" else subprocess.Popen
+    return begin(
         [*RIG, *words],
         cwd=cwd,
         env=environment(**(env or {})),
@@ -157,6 +158,16 @@ def start_rig(*args, cwd, env=None, **options):
         encoding="utf-8",
         **options,
     )
+
+
+class _Breakable(subprocess.Popen):
+    """A process of Windows, where Ctrl-Break is what one can send to another, and hears alone."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, creationflags=subprocess.CREATE_NEW_PROCESS_GROUP, **options)
+
+    def send_signal(self, number):
+        super().send_signal(signal.CTRL_BREAK_EVENT if number == signal.SIGINT else number)
 
 
 # Prepares what the commands need, then becomes a ``rig`` process per line of standard input.
@@ -332,6 +343,9 @@ def forked_rig(**env):
 
     Its result is a CompletedProcess.
     """
+    if not hasattr(os, "fork"):
+        yield lambda args, cwd, report=False: rig(*args, cwd=cwd, env=env, report=report)
+        return
     server = _shared_server()
     yield lambda args, cwd, report=False: server.run(_words(args, report), cwd, env=env)
 
@@ -354,7 +368,7 @@ def only_capture(root):
 
 
 def record_of(folder):
-    return json.loads((folder / "run.json").read_text())
+    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
 def rows_in(folder):

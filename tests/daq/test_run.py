@@ -4,6 +4,8 @@ import hashlib
 import itertools
 import json
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from daq.logs.capture import Capture
 from daq.logs.recording import load
 from tests.daq.support import EXPERIMENT as SETTINGS
 from tests.daq.support import (
+    environment,
     install_faulty,
     journal_of,
     merged,
@@ -393,6 +396,37 @@ def test_a_closed_terminal_stops_a_run_too(tmp_path, plugin):
     process.communicate(timeout=30)
     assert process.returncode == 1
     assert record_of(folder)["reason"] == "stopped by SIGHUP during run"
+    assert_left_safe(tmp_path)
+
+
+_CLOSED = """
+import ctypes, sys, threading, time
+from pathlib import Path
+import daq.cli
+
+def close():
+    while not any(log.stat().st_size > 5000 for log in Path("runs").glob("*/log.csv")):
+        time.sleep(0.01)
+    ctypes.WinDLL("kernelbase").CtrlRoutine(2)  # as the console does, in a thread of the process
+
+threading.Thread(target=close, daemon=True).start()
+sys.argv = ["rig", "run", "e.yaml", "--rig", "rig.yaml"]
+daq.cli.main()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "win32", reason="windows of Windows")
+def test_a_closed_window_stops_a_run_before_windows_ends_the_process(tmp_path, plugin):
+    write_experiment(tmp_path / "e.yaml", duration=30)
+    write_rig(tmp_path / "rig.yaml", **merged(FAULTY, {"options": {"time": "real"}}))
+    words = [sys.executable, "-c", _CLOSED]
+    subprocess.run(words, cwd=tmp_path, env=environment(**plugin), timeout=60, check=False)
+    record = record_of(only_capture(tmp_path))
+    assert (record["status"], record["reason"]) == (
+        "stopped",
+        "stopped by a closed window during run",
+    )
+    assert record["outputs"]["confirmed"]
     assert_left_safe(tmp_path)
 
 

@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 import zlib
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -228,6 +228,7 @@ def paper_device(**lies):
         thread = threading.Thread(target=serve, daemon=True)
         thread.start()
         yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-        server.shutdown(socket.SHUT_RDWR)
+        with suppress(OSError):  # Windows, where closing it ends an accept as well
+            server.shutdown(socket.SHUT_RDWR)
     thread.join(timeout=5.0)
     assert not thread.is_alive()
