@@ -60,7 +60,12 @@ class Faults(Section):
 class Simulation(Section):
     """Options of the simulated rig."""
 
-    seed: int = Field(0, ge=0, le=2**32 - 1, description="of noise and offsets")
+    seed: int | None = Field(
+        None,
+        ge=0,
+        le=2**32 - 1,
+        description="of noise and offsets; null: another for each run of a folder, written down",
+    )
     ideal: bool = Field(False, description="no noise, offsets or quantisation")
     time: Literal["virtual", "real"] = Field(
         "virtual", description="as fast as it can, or at the pace of the clock"
@@ -139,7 +144,8 @@ class SimulatedDevice:
         if self._unit is not None:
             self._motion, self._n_inputs = [0, 1], len(CHANNELS)
         self._user = SimulatedUser(holds, options.hand, options.hand_path == "smooth")
-        self._rng = np.random.default_rng(options.seed)
+        seed = options.seed or 0
+        self._rng = np.random.default_rng(seed)
         worst = 0.0 if options.ideal else options.imperfections.offset
         senses = np.array([options.current_sense, options.current_sense, options.torque_sense])
         offsets = self._rng.uniform(-worst, worst, len(ANALOG_INPUTS))
@@ -149,8 +155,8 @@ class SimulatedDevice:
         self._single = np.zeros((2, self._n_inputs))
         self._steppers: dict[float, Stepper | ForeignStepper] = {}
         # Draws of their own, so that the noise stays what it is without them.
-        self._chance = np.random.default_rng([options.seed, 1])
-        self._encoder_phase = float(np.random.default_rng([options.seed, 2]).random())
+        self._chance = np.random.default_rng([seed, 1])
+        self._encoder_phase = float(np.random.default_rng([seed, 2]).random())
         self._late: list[tuple[int, FloatArray]] = []
         self._queue = CommandQueue()
         self._clock = 0.0  # device time since it was switched on [s], at the next tick

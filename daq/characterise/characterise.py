@@ -314,13 +314,14 @@ def _run(current: Round, done: Sequence[Round], watch: Watch) -> None:
     A simulated rig makes the same noise from the same seed: each run has a seed of its own.
     """
     config, _ = load_rig(current.rig, watch=watch)
-    seed: int | None = getattr(config.options, "seed", None)
+    has_noise = "seed" in type(config.options).model_fields
+    seed: int = getattr(config.options, "seed", None) or 0
     first = sum(len(each.experiments) for each in done)
     for place, experiment in enumerate(current.experiments, first):
         if current.is_left_out(experiment):
             watch(Note("warning", f"{experiment.stem} is left out: limits have stopped it twice"))
         elif not current.captures(experiment):
-            options = None if seed is None else {"seed": (seed + place) % _SEEDS}
+            options = {"seed": (seed + place) % _SEEDS} if has_noise else None
             record(experiment, current.rig, current.runs, options=options, watch=watch)
     if not _logs([*done, current]):
         cure = "see why in the run.json of each, then characterise anew"

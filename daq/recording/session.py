@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from daq.errors import ConfigError, together
 from daq.experiment import Plan
 from daq.findings import Findings
 from daq.hal import Device, Phase
-from daq.logs.capture import LOG_NAME
+from daq.logs.capture import LOG_NAME, RUN_NAME
 from daq.logs.metadata import amended
 from daq.logs.recording import Recording, load
 from daq.lookup.experiments import LoadedExperiment, load_experiment
@@ -60,11 +60,12 @@ class Session:
         Raises DeviceError, InterlockError, RunError, KeyboardInterrupt or Terminated, whose notes
         say whether the outputs were read as zero then.
         """
-        run = _run(self.loaded, self.rig, self.device, out, watch, self.rig_file)
+        rig, device = _with_noise_of_its_own(self.rig, self.device, out)
+        run = _run(self.loaded, rig, device, out, watch, self.rig_file)
         findings = conclude_or_warn(self.loaded.experiment, run.folder, watch)
         second = None
         if validation and self.validation is not None:
-            second = _run(self.validation, self.rig, self.device, out, watch, self.rig_file)
+            second = _run(self.validation, rig, device, out, watch, self.rig_file)
         doubts = [doubt for each in (run, second) if each for doubt in each.doubts]
         doubts += currents.notes(run.folder / LOG_NAME, self.rig)
         return SessionResult(run, second, findings, doubts)
@@ -138,12 +139,26 @@ def record(
     name = str(rig or rig_for(str(experiment), watch))
     config, device = load_rig(name, options, watch)
     _plan([loaded], config, name)
+    config, device = _with_noise_of_its_own(config, device, Path(out))
     return load(_run(loaded, config, device, Path(out), watch, name).folder)
 
 
 def _noting(loaded: LoadedExperiment, notes: list[str]) -> LoadedExperiment:
     metadata = amended(loaded.experiment.metadata, changes_of(notes))
     return replace(loaded, experiment=loaded.experiment.model_copy(update={"metadata": metadata}))
+
+
+def _with_noise_of_its_own(rig: RigConfig, device: Device, out: Path) -> tuple[RigConfig, Device]:
+    """A simulated rig whose file names no seed, with that of the next run in a folder.
+
+    Noise that two logs share would pass for what both say of the plant.
+    """
+    options = rig.options
+    if "seed" not in type(options).model_fields or getattr(options, "seed", None) is not None:
+        return rig, device
+    options = options.model_copy(update={"seed": sum(1 for _ in out.glob(f"*/{RUN_NAME}"))})
+    make: Callable[[Any], Device] = type(device)
+    return rig.model_copy(update={"options": options}), make(options)
 
 
 def _plan(
