@@ -45,6 +45,23 @@ def test_a_recorded_run_is_the_one_the_command_records(recorded):
     assert not validation.frame["cmd_voltage_motor"].equals(training.frame["cmd_voltage_motor"])
 
 
+@pytest.mark.parametrize("seed", [None, 5])
+def test_runs_on_a_simulated_rig_share_noise_only_where_its_file_names_a_seed(tmp_path, seed):
+    """Logs of one noise confirm each other's errors, and are refused as copies."""
+    write_experiment(tmp_path / "e.yaml")
+    rig_file = write_yaml(tmp_path / "rig.yaml", {"options": {"seed": seed} if seed else {}})
+    runs = [record(tmp_path / "e.yaml", rig_file, tmp_path / "runs") for _ in range(3)]
+    seeds = [run.record["rig"]["options"]["seed"] for run in runs]
+    assert seeds == ([5, 5, 5] if seed else [0, 1, 2])
+    # What is no motion: the torque's changes from sample to sample.
+    noise = [np.diff(run.frame["torque"], 3) for run in runs]
+    shared = np.corrcoef(noise)[np.triu_indices(3, 1)]
+    assert np.all(shared == pytest.approx(1.0)) if seed else np.all(np.abs(shared) < 0.3)
+    # What is written down makes the same run anew.
+    again = record(tmp_path / "e.yaml", rig_file, tmp_path / "new", options={"seed": seeds[1]})
+    assert again.frame.equals(runs[1].frame)
+
+
 @pytest.mark.soak
 def test_an_identification_is_the_one_the_command_makes(recorded, found):
     root, training, validation = recorded
