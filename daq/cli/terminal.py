@@ -407,23 +407,45 @@ class _PlainLines:
 def _bars() -> Iterator[Callable[[Progress], None]]:
     from rich import progress
     from rich.console import Console
+    from rich.text import Text
+
+    class Taken(progress.ProgressColumn):
+        """How long an activity takes, or took."""
+
+        def render(self, task: progress.Task) -> Text:
+            seconds = task.elapsed if task.finished_time is None else task.finished_time
+            minutes, rest = divmod(seconds or 0.0, 60.0)
+            return Text(f"{minutes:.0f}:{int(rest):02} min" if minutes else f"{rest:.1f} s")
 
     console = Console(file=sys.stderr)
     columns = [
         progress.TextColumn("{task.description:<20}"),
         progress.BarColumn(bar_width=max(2, min(30, console.width - _BESIDE_BAR))),
         progress.TextColumn("{task.fields[note]}"),
-        progress.TimeElapsedColumn(),
+        Taken(),
     ]
     if console.width >= _BESIDE_BAR + 22:
         columns += [progress.TextColumn("[dim]left"), progress.TimeRemainingColumn()]
     with progress.Progress(*columns, console=console) as bars:
         tasks: dict[str, progress.TaskID] = {}
+        latest = ""
 
         def update(step: Progress) -> None:
+            nonlocal latest
             name, total, note = step.activity, step.total, step.status
+            if name != latest:
+                end()
+                if name in tasks:
+                    bars.reset(tasks[name])  # what begins anew
+                latest = name
             if name not in tasks:
                 tasks[name] = bars.add_task(name, total=total, note=note)
             bars.update(tasks[name], completed=step.done, total=total, note=note)
 
+        def end() -> None:
+            """One activity is over when the next begins, however early: its bar is full then."""
+            if latest:
+                bars.update(tasks[latest], total=1, completed=1)
+
         yield update
+        end()

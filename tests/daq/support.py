@@ -41,13 +41,13 @@ def file_limit(size):
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
-def on_terminal(words, folder, columns, **variables):
+def on_terminal(words, folder, columns, program=RIG, **variables):
     """What ``rig`` shows on a terminal so wide, without its colours; variables: environment's."""
     import pty  # not on Windows
 
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
-        [*RIG, *map(str, words)], cwd=folder, stdin=theirs, stdout=theirs, stderr=theirs,
+        [*program, *map(str, words)], cwd=folder, stdin=theirs, stdout=theirs, stderr=theirs,
         env=environment(COLUMNS=str(columns), TERM="xterm", **variables),
     )  # fmt: skip
     os.close(theirs)

@@ -13,7 +13,15 @@ import typer
 from daq.cli.app import app
 from daq.cli.terminal import Volume, output, print_next, watching
 from daq.progress import Note
-from tests.daq.support import RIG, environment, forked_rig, rig, write_experiment, write_rig
+from tests.daq.support import (
+    RIG,
+    environment,
+    forked_rig,
+    on_terminal,
+    rig,
+    write_experiment,
+    write_rig,
+)
 
 GROUPS = typer.main.get_command(app).commands
 COMMANDS = {
@@ -184,6 +192,32 @@ def test_a_narrow_terminal_cuts_nothing(columns):
         assert re.search("20260101T120000Z- +0.0256 ", shown), "wrapped where a name has a joint"
     wide = shown[shown.index("Wide") :].splitlines()
     assert columns == 30 or max(map(len, wide)) <= columns
+
+
+BARS = """
+import time
+from daq.cli.terminal import watching
+from daq.progress import Progress
+with watching(quiet=False) as watch:
+    watch(Progress("Search", 6, 40, "generation 6/40"))
+    watch(Progress("Fit", 1, 9, "iteration 1"))
+    time.sleep(1.2)
+    watch(Progress("Fit", 9, 9, "iteration 9"))
+    watch(Progress("Search", 2, 40, "generation 2/40"))
+    time.sleep(0.3)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
+def test_what_ended_early_is_full_when_the_next_begins_and_its_clock_stands(tmp_path):
+    shown = on_terminal(["-c", BARS], tmp_path, columns=100, program=[sys.executable])
+    frames = [frame.splitlines() for frame in shown.split("\r") if "Fit" in frame]
+    full = 30 * "━"
+    search, fit = frames[-1]
+    assert full in search and "generation 2/40" in search
+    assert full in fit and "iteration 9" in fit and float(re.search(r"(\d+\.\d) s", fit)[1]) >= 1.2
+    meanwhile = next(search for search, fit in frames if "iteration 1" in fit)
+    assert full in meanwhile and "generation 6/40" in meanwhile
 
 
 def test_a_note_is_shown_once_however_often_it_is_given(capsys):
