@@ -59,12 +59,13 @@ def best_alternative(
 
     Or a simpler one that it contains, where that has the lower BIC: a function of speed and angle
     explains what one of speed alone does. Without a variant, the model with the surest function
-    that moves its parameters. None where there is neither, or none of its simulations succeeds.
+    that moves its parameters, of the shape by which a fit explains most. None where there is
+    neither, or none of its simulations succeeds.
     """
     if estimator.model is None:
         return None
-    suspected, terms = _suspected(findings, estimator.model)
-    fitted = {name: _fitted(estimator, model, training) for name, model in suspected.items()}
+    suspected = _suspected(findings, estimator.model)
+    fitted = {name: _fitted(estimator, s.model, training) for name, s in suspected.items()}
     estimators = {name: e for name, e in fitted.items() if e is not None}
     if not estimators:
         return None
@@ -84,7 +85,7 @@ def best_alternative(
         {n: (float(a), float(b)) for n, a, b in zip(names, *shares, strict=True)},
         _moved(uncertainty, estimators[name].parameters_),
         comparison,
-        terms,
+        suspected[name].terms,
     )
 
 
@@ -141,25 +142,36 @@ def _raised(noise: FloatArray, place: int, size: float) -> FloatArray:
     return raised
 
 
-def _suspected(
-    findings: Sequence[Finding], model: ProcessModel
-) -> tuple[dict[str, ProcessModel], tuple[AddedTerm, ...]]:
-    """Models to be fitted by name, the surest first, and the terms that were added to one."""
+@dataclass(frozen=True)
+class _Suspected:
+    """A model to be fitted, and the terms that were added to it, none to a variant."""
+
+    model: ProcessModel
+    terms: tuple[AddedTerm, ...] = ()
+
+
+def _suspected(findings: Sequence[Finding], model: ProcessModel) -> dict[str, _Suspected]:
+    """Models to be fitted by name, the surest first."""
     variants = variants_of(model)
     for finding in findings:
         if finding.kind == "variant":
             parts = {name: set(v.parameter_names) for name, v in variants.items()}
             least, most = set(model.parameter_names), parts[finding.name]
             within = [name for name, between in parts.items() if least < between < most]
-            return {name: variants[name] for name in (finding.name, *within)}, ()
+            return {name: _Suspected(variants[name]) for name in (finding.name, *within)}
     for finding in findings:
         if finding.term is not None and finding.counts:
+            terms = (finding.term, *finding.rivals)
             try:
-                added = with_terms(model, [finding.term])
+                return {
+                    description(replace(finding, term=term)): _Suspected(
+                        with_terms(model, [term]), (term,)
+                    )
+                    for term in terms
+                }
             except ModelError:  # it has a parameter of that name
-                return {}, ()
-            return {description(finding): added}, (finding.term,)
-    return {}, ()
+                return {}
+    return {}
 
 
 _MODEL = "the model"

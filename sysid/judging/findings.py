@@ -39,8 +39,9 @@ class Finding:
     """Something that the model lacks: what it is, how sure, and what it would move.
 
     name, unit: as of its suspect. amplitude: of a channel's fault, in the unit; None of others.
-    term: of a function the one that it is most like, with a range to fit it in. of_input: whether
-    a channel is an input. p_value: by chance,
+    term: of a function the one that it is most like, with a range to fit it in; rivals: those of
+    other shapes that it is like as well, between which fits decide. of_input: whether a channel is
+    an input. p_value: by chance,
     all tests counted. share: of the whitened residuals' squares that it explains. moves: the
     farthest first. wider: how many times as wide the interval is that it widens most.
     """
@@ -55,6 +56,7 @@ class Finding:
     term: AddedTerm | None = None
     of_input: bool = False
     wider: float = 1.0
+    rivals: tuple[AddedTerm, ...] = ()
 
     @property
     def farthest(self) -> float:

@@ -76,6 +76,7 @@ _LEAST = 1e-6  # error of an output in parts of the largest, below which it weig
 _FLAT = 0.999  # of what the best size of a delay explains, that is as good
 _SAME_RATE = 1e-3  # of a sample time
 _WHOLE = 0.2  # share by which a mean may seem to be longer or shorter than it is
+_NEARLY = 0.3  # of what the likeliest shape of a function explains, that a fit may turn round
 _REACH = 10.0  # of a term's range in parts of the size that its test found
 # Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
 # its value, the data want it elsewhere, and nobody knows where.
@@ -260,7 +261,14 @@ class _Tests:
             if suspect.closer is not None:
                 suspect, result, residual = self._closer(suspect, result, residual)
                 changes[surest] = suspect.changes / self._scales[..., None]
-            term = self._term(suspect, changes[surest], residual)
+            alike = [
+                i
+                for i in significant
+                if i != surest and suspects[i].acts_like(suspect) and not suspects[i].repeats
+            ]
+            terms = self._terms(suspect, changes[surest], residual)
+            for i in alike:
+                terms += self._terms(suspects[i], changes[i], results[i][1])
             # Of what shape a function is hardly shows, and decides what it moves.
             shapes = [
                 self._moved(changes[i], results[i][0])
@@ -268,7 +276,7 @@ class _Tests:
                 if i != surest and suspects[i].shares_place(suspect)
             ]
             moves = [self._moved(changes[surest], result), *shapes]
-            self.findings.append(self._finding(suspect, result, moves, logs[surest], term))
+            self.findings.append(self._finding(suspect, result, moves, logs[surest], terms))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -437,25 +445,27 @@ class _Tests:
         whitening = Whitener.of(self._local, residual)
         return Regression(whitening, self._columns, self._free, self._residual, self._noises)
 
-    def _term(
+    def _terms(
         self, suspect: Suspect, changes: FloatArray, residual: FloatArray
-    ) -> AddedTerm | None:
-        """The term of a suspect that by itself explains most; residual: what all leave."""
+    ) -> list[AddedTerm]:
+        """Terms of a suspect that by themselves explain, the most first; residual: what all leave.
+
+        Those of which a step tells no more than that a fit may well end with them.
+        """
         regression = self._coloured_by(residual)
         if suspect.terms and suspect.terms[0].shape == "sine":
             both = regression.test(changes, False)
-            return (
-                suspect.terms[0] if both is None else _of_phase(suspect.terms[0], both.amplitudes)
-            )
+            first = suspect.terms[0]
+            return [first if both is None else _of_phase(first, both.amplitudes)]
         alone = [
-            (result.share, float(np.abs(result.amplitudes[0])), term)
+            (result.share, _with_reach(term, float(np.abs(result.amplitudes[0]))))
             for k, term in enumerate(suspect.terms)
             if (result := regression.test(changes[..., [k]], False)) is not None
         ]
         if not alone:
-            return suspect.terms[0] if suspect.terms else None
-        _, size, term = max(alone, key=lambda test: test[0])
-        return _with_reach(term, size)
+            return list(suspect.terms[:1])
+        alone.sort(key=lambda test: -test[0])
+        return [term for share, term in alone if share > _NEARLY * alone[0][0]]
 
     def _moved(self, changes: FloatArray, result: Regressed) -> FloatArray:
         """By how much each estimate moves where a fit, by its own weights, has a suspect as well.
@@ -491,7 +501,7 @@ class _Tests:
         result: Regressed,
         moves: Sequence[FloatArray],
         log_p: float,
-        term: AddedTerm | None,
+        terms: Sequence[AddedTerm],
     ) -> Finding:
         """Of a suspect by its test, each estimate moved as by whichever moves it farthest."""
         moved = np.array([max(each, key=abs) for each in zip(*moves, strict=True)])
@@ -512,8 +522,9 @@ class _Tests:
             float(np.exp(min(log_p, 0.0))),
             result.share,
             tuple(moves_to),
-            term,
+            next(iter(terms), None),
             suspect.of_input,
+            rivals=tuple(terms[1:]),
         )
 
     def _within_limits(self, move: Move) -> Move:

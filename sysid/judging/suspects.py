@@ -106,16 +106,23 @@ class Suspect:
         rubs = any(term.shape == "stribeck" for term in self.terms)
         return rubs or self.kind in ("variant", "saturation", "filter", "lag", "play", "noise")
 
+    @property
+    def repeats(self) -> bool:
+        """Whether it is a sine of a signal."""
+        return any(term.shape == "sine" for term in self.terms)
+
     def shares_place(self, suspect: "Suspect") -> bool:
         """Whether it is a function of the same signal in the same equation, of whatever shape.
 
         Sines of other periods are no other shapes of one that repeats.
         """
-        if not self.terms or not suspect.terms:
-            return False
+        return self.acts_like(suspect) and not (self.repeats or suspect.repeats)
+
+    def acts_like(self, suspect: "Suspect") -> bool:
+        """Whether it is a function of the same signal in the same equation, a sine as well."""
         terms = (*self.terms, *suspect.terms)
-        repeats = any(term.shape == "sine" for term in terms)
-        return len({(term.equation, term.of) for term in terms}) == 1 and not repeats
+        places = {(term.equation, term.of) for term in terms}
+        return bool(self.terms) and bool(suspect.terms) and len(places) == 1
 
     def same(self, suspect: "Suspect") -> bool:
         """Whether it is a delay of the same channel, of another size."""

@@ -164,6 +164,43 @@ def test_a_force_that_repeats_with_a_position_is_named_with_its_period(cogging):
     assert "that repeats with x (every 0.024), like cogging" in " ".join(verdict.reasons)
 
 
+COIL = ProcessModel(
+    name="coil",
+    states=(State("x", "m"), State("v", "m/s")),
+    inputs=(Input("force", "N", "zoh"),),
+    outputs=(Output("x", "m"),),
+    parameters=(
+        Parameter("mass", "kg", 0.1, 0.01, 1.0, "log"),
+        Parameter("damping", "N*s/m", 1.0, 0.1, 10.0, "log"),
+        Parameter("stiffness", "N/m", 100.0, 10.0, 2000.0, "log"),
+    ),
+    derivative=lambda x, u, p: (x[1], (u[0] - p[1] * x[1] - p[2] * x[0]) / p[0]),
+)
+
+
+@pytest.mark.parametrize("hardening", mostly_soak([2e4, 9e5, 3e3]))
+def test_a_spring_that_hardens_is_no_cogging_and_no_other_power(hardening):
+    """A step along a line takes its force for one that repeats, or a square; fits decide."""
+
+    def log(seed, n=1500, dt=2e-3):
+        rng = np.random.default_rng(seed)
+        force = np.repeat(rng.uniform(-6.5, 6.5, n // 20), 20)[:, None]
+
+        def derivative(x, u, p):
+            return x[1], (u[0] - 1.4 * x[1] - 220.0 * x[0] - hardening * x[0] ** 3) / 0.12
+
+        real = replace(COIL, derivative=derivative)
+        exact = simulate(real, np.ones(3), Dataset(force, np.zeros((n, 1)), dt), rtol=1e-7)
+        return Dataset(force, exact + 5e-5 * rng.standard_normal((n, 1)), dt)
+
+    training, validation = log(1), log(2)
+    estimator = GASSI(COIL, population=30, generations=10).fit(training)
+    verdict = verdict_of(estimator, [training], [validation])
+    reasons = " ".join(verdict.parameters.reasons)
+    assert "a term in x (cube) in dv/dt" in reasons and "-> 100 %" in reasons
+    assert "stiffness" in reasons and "-> 220 N/m" in reasons
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("pull", [3e-3, 0.0])
 @pytest.mark.parametrize("logs", [1, 2])
