@@ -6,7 +6,7 @@ right and predict hardly more than noise hides.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -251,6 +251,7 @@ def _prediction(
         poor, excused_there = _poor_fits(model, training, "even on the training data")
         grave += poor.values()
         light += (reason for name, reason in excused_there.items() if name not in excused)
+    light += _far_from_noise(model, validation or training, poor)
     light += _input_traces(model, validation or training)
     light += _failing_starts((*training, *validation))
     return Statement.of(grave, light, _praise(model, training, validation))
@@ -284,6 +285,25 @@ def _poor_fits(
         else:
             poor[name] = f"{reason}."
     return poor, excused
+
+
+def _far_from_noise(
+    model: ProcessModel, results: Sequence[RecordResult], poor: Container[str]
+) -> Iterator[str]:
+    """Reasons: outputs of which much is left that is no noise, beside those explained poorly."""
+    left = (1.0 - mean_known([result.metrics.fit for result in results], 0) / 100.0) ** 2
+    wanders = np.mean([result.residuals.white for result in results], axis=0) < _WANDERS
+    calibrated = _known(results)
+    beyond = np.where(calibrated, _above_floor(results), wanders)
+    for j in np.flatnonzero((left > _MUCH) & beyond).tolist():
+        name = model.output_names[j]
+        why = (
+            "more than noise explains"
+            if calibrated[j]
+            else "and wanders, as no sensor's noise does"
+        )
+        if name not in poor:
+            yield f"{100.0 * left[j]:.0f} % of {name}'s variance is left, {why}."
 
 
 def _of_intervals(

@@ -498,12 +498,26 @@ def test_much_that_wanders_makes_parameters_doubtful(size, pole, trust):
     found = verdict([wandering(1, size, pole)], [wandering(2, size, pole)])
     assert found.trust == trust, found.reasons
     if trust == "limited":
-        (reason,) = found.reasons
-        assert " % of speed's variance is left, and wanders" in reason
+        both = found.predicted.reasons + found.parameters.reasons
+        assert len(both) == 2
+        assert all(" % of speed's variance is left, and wanders" in reason for reason in both)
 
 
 def nothing_expected(data):
     return expected([np.nan, np.nan], data)
+
+
+@pytest.mark.parametrize(("size", "trust"), [(0.3, "limited"), (0.1, "good")])
+def test_predictions_of_which_much_is_left_beyond_a_known_noise_are_not_good(size, trust):
+    def above(seed):
+        data = record(seed)
+        wrong = size * np.random.default_rng([seed, 2]).standard_normal((N, 2)) * [1.0, 0.1]
+        return examine(data, data.outputs - wrong, expected([NOISE**2, NOISE**2], data))
+
+    predicted = verdict([above(1)], [above(2)]).predicted
+    assert predicted.trust == trust
+    if trust == "limited":
+        assert predicted.reasons == ("9 % of speed's variance is left, more than noise explains.",)
 
 
 @pytest.mark.parametrize(("push", "trust"), [(1.0, "limited"), (0.2, "good")])
