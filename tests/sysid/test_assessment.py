@@ -517,7 +517,7 @@ def test_predictions_of_which_much_is_left_beyond_a_known_noise_are_not_good(siz
     predicted = verdict([above(1)], [above(2)]).predicted
     assert predicted.trust == trust
     if trust == "limited":
-        assert predicted.reasons == ("9 % of speed's variance is left, more than noise explains.",)
+        assert predicted.reasons == ("10 % of speed's variance is left, more than noise explains.",)
 
 
 @pytest.mark.parametrize(("push", "trust"), [(1.0, "limited"), (0.2, "good")])
