@@ -233,7 +233,7 @@ def uncertainty(
         analysis.reported_covariance(parameters),
         analysis.covariance.singular_values,
         analysis.covariance.rank,
-        tuple(rival for rival in minima if any(e.excludes(rival.values) for e in disputed)),
+        _told_apart(minima, disputed),
         disagreement=spread.disagreement if spread else 1.0,
         factor=analysis.factor(
             others, itertools.chain(parameters, *(a.determined for a in ambiguities)), bottoms
@@ -246,6 +246,22 @@ def uncertainty(
     joint, simultaneous = analysis.together(intervals)
     moved = analysis.moved_by_bends(intervals) if np.any(result.bent > MISJUDGED) else 0.0
     return replace(result, joint=joint, simultaneous=simultaneous, moved_by_bends=moved)
+
+
+def _told_apart(minima: Sequence[Rival], disputed: Sequence[Estimate]) -> tuple[Rival, ...]:
+    """Rivals that dispute an estimate; of those within all disputed intervals of one the first."""
+    kept: list[Rival] = []
+    for rival in minima:
+        if any(estimate.excludes(rival.values) for estimate in disputed) and not any(
+            all(
+                first.intervals[e.name][0] <= rival.values[e.name] <= first.intervals[e.name][1]
+                for e in disputed
+                if e.name in first.intervals
+            )
+            for first in kept
+        ):
+            kept.append(rival)
+    return tuple(kept)
 
 
 def _with_bottoms(estimate: Estimate, bottoms: Sequence["_Analysis"]) -> Estimate:

@@ -399,6 +399,10 @@ def test_minima_with_a_wall_between_them_are_rivals_each_with_an_interval():
     assert a.why == "rival" and a.low < abs(a.value) * np.sign(a.value) < a.high
     low, high = rival.intervals["a"]
     assert (low, high) == pytest.approx((-a.high, -a.low), rel=1e-3)
+    # A minimum beside it, within its interval, is no further answer.
+    beside = result.rivals[0] + [0.2 * (high - low), 0.0]
+    both = [*result.rivals, beside]
+    assert uncertainty(result.optimum.objective, result.optimum.chromosome, both).rivals == (rival,)
 
 
 @pytest.mark.parametrize(("short", "why"), [(0.0, ""), (1.0, ""), (4.0, "rival")])
