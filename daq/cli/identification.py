@@ -264,12 +264,12 @@ def _show_residuals(rows: Rows, noisy: bool) -> None:
     terminal.print_table(title, head, cells)
     coloured = [name for name, (past, *_) in table.shares.items() if past < _COLOURED]
     if coloured:
-        cause = "as what the model lacks makes them, or a sensor's own noise"
+        cause = "as what the model lacks makes it, or a sensor's own noise"
         if noisy:
-            cause = "as noise of a measured input makes them"
+            cause = "as noise of a measured input makes it"
         terminal.print_text(
-            f"Few with itself ({', '.join(coloured)}): coloured residuals, {cause}. The intervals "
-            "allow for it; few with an input would speak against the model."
+            f"What is left of {' and '.join(coloured)} goes with its own past, {cause}: the "
+            "intervals allow for that. Going with an input would speak against the model."
         )
 
 

@@ -98,8 +98,8 @@ def _show_identifiable(structure: Structure) -> None:
         print()
         if math.isfinite(result.gap):
             terminal.print_text(
-                f"What counts as a change of the outputs is at least {result.gap:.0f} decades "
-                "above what counts as none."
+                "Sure to rounding: the least effect that counts as one is "
+                f"1e{result.gap:.0f} times the largest that does not."
             )
         terminal.print_next("rig identify LOG --set fixed.NAME=VALUE, with what was measured")
 

@@ -355,12 +355,12 @@ class Rows(Shown):
     @property
     def headline(self) -> str:
         """How many parameters are known by themselves, and how many otherwise."""
-        parts = [f"{len(self.determined)} of {len(self.free)} free parameters by themselves"]
+        parts = [f"{len(self.determined)} of {len(self.free)} free parameters each by itself"]
         if self.bounded:
             parts.append(f"{len(self.bounded)} on one side")
         if self.combinations:
             n = len(self.combinations)
-            parts.append(f"{n} combination{'' if n == 1 else 's'} of others")
+            parts.append(f"{n} combination{'' if n == 1 else 's'}")
         last = f" and {parts.pop()}" if len(parts) > 1 else ""
         return f"{', '.join(parts)}{last}"
 
@@ -441,8 +441,8 @@ def start_sentences(logs: Sequence[Mapping[str, Any]]) -> list[str]:
             continue
         where = [
             f"{state} at {quantity(start['value'], start['unit'])}, "
-            f"{quantity(start['value'] - start['first_sample'], start['unit'], 2)} from its first "
-            f"sample (searched in {quantity(start['range'][0], start['unit'])} .. "
+            f"{quantity(start['value'] - start['first_sample'], start['unit'], 2)} away from its "
+            f"first sample (searched in {quantity(start['range'][0], start['unit'])} .. "
             f"{quantity(start['range'][1], start['unit'])})"
             for state, start in log["starts"].items()
             if start.get("first_sample") is not None
@@ -454,8 +454,8 @@ def start_sentences(logs: Sequence[Mapping[str, Any]]) -> list[str]:
             )
         ]
         sentences.append(
-            f"{log['name']} starts with {'; '.join(where)}. From the first sample: "
-            f"{', '.join(fits)}."
+            f"{log['name']} starts with {'; '.join(where)}. Started at the first "
+            f"sample: {', '.join(fits)}."
         )
     return sentences
 

@@ -682,7 +682,7 @@ class GASSI(RecordEstimator):
         timed = any(record.windows.size for record in records)
         reason = f"{names} is measured with noise, which a free run passes on to the outputs"
         if timed:
-            reason += ", and it is known over which times they were averaged"
+            reason += ", and over which times samples were averaged is known"
         return "innovations" if timed else "compensated", reason
 
     def _check_filter(self, noisy: tuple[int, ...]) -> None:

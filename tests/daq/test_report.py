@@ -165,7 +165,7 @@ def test_what_acts_only_together_is_told_with_what_would_help(told):
     assert "measure b by other means" in text and "under 'fixed'" in text
     # Of tau, b a, c and idle, however little that moves.
     assert document["determined_directions"] == 4
-    determined = "1 of 5 free parameters by themselves, 1 on one side and 1 combination of others"
+    determined = "1 of 5 free parameters each by itself, 1 on one side and 1 combination"
     assert f"Determined: {determined}." in " ".join(text.split())
     together = "Of 100 repetitions each interval holds the true value in 95, all 3 at once in"
     assert together in " ".join(text.split())

@@ -74,7 +74,7 @@ def test_combinations_stand_below_the_parameters_that_act_only_together():
     total = QuantityRow("J_m + J_b", 1.05e-4, "kg*m^2", (1.0e-4, 1.1e-4))
     tied = AmbiguityRow("tied", ("J_m", "J_b"), (total,), ())
     rows = Rows(tuple(inertia), (tied,), (), {}, {"training": (), "validation": ()}, refined=True)
-    assert repr(rows) == "<Rows: 0 of 2 free parameters by themselves and 1 combination of others>"
+    assert repr(rows) == "<Rows: 0 of 2 free parameters each by itself and 1 combination>"
     shown = {row[0]: row[1:] for row in table_of(rows)}
     assert shown["J_m + J_b"] == ["1.05e-4", "1.00e-4 .. 1.10e-4", "kg*m^2", ""]
     assert shown["J_b"][3] == "only together"
