@@ -212,9 +212,9 @@ def _text_of(path: Path) -> str:
     except FileNotFoundError:
         cure = nearest_file(path) or "check its name"
         raise ConfigError("there is no such file", cure=cure, file=path) from None
-    except IsADirectoryError:
-        raise ConfigError("this is a folder", cure="name a YAML file", file=path) from None
     except OSError as error:
+        if path.is_dir():  # for Windows one that may not be opened
+            raise ConfigError("this is a folder", cure="name a YAML file", file=path) from None
         raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
 
 

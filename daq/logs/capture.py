@@ -9,6 +9,7 @@ import platform
 import re
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,13 +138,12 @@ def further_parts(csv: Path) -> list[str]:
 
 
 def _new_folder(root: Path, stem: str) -> Path:
+    if root.is_file():
+        raise ConfigError("this is a file", cure="choose a folder with --out", file=root)
     for attempt in range(1, 1000):
         folder = root / (stem if attempt == 1 else f"{stem}-{attempt}")
-        try:
+        with suppress(FileExistsError):
             make_folder(folder, exist_ok=False)
             return folder
-        except FileExistsError:
-            if root.exists() and not root.is_dir():
-                break
     problem = "no capture folder can be made here"
     raise ConfigError(problem, cure="choose another with --out", file=root)

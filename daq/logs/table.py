@@ -243,9 +243,9 @@ def _complete_lines(
     except FileNotFoundError:
         cure = "name a capture folder or a CSV file"
         raise ConfigError("there is no such log", cure=cure, file=path) from None
-    except IsADirectoryError:
-        raise ConfigError("this is a folder without a log.csv in it", file=path) from None
     except OSError as error:
+        if path.is_dir():
+            raise ConfigError("this is a folder without a log.csv in it", file=path) from None
         raise ConfigError(f"cannot be read: {error.strerror}", file=path) from None
     if len(data) == n_bytes:
         # Not in the middle of a character.
