@@ -382,7 +382,9 @@ class Identification(Shown):
         """
         import pandas as pd
 
-        return pd.DataFrame(self.rows.errors).set_index(["part", "log", "output"])
+        table = pd.DataFrame(self.rows.errors).set_index(["part", "log", "output"])
+        first = ["fit_percent", "rmse_absolute"]  # which a narrow terminal is to show
+        return table[[*first, *(name for name in table if name not in first)]]
 
     def save(self, folder: str | Path) -> Path:
         """Write ``parameters.yaml`` into a folder; its path. Raises ConfigError."""

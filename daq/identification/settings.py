@@ -501,7 +501,7 @@ def _beyond_limits(file: YamlFile, fixed: Mapping[str, Any], model: ProcessModel
         if name not in model.parameter_names or not isinstance(value, int | float):
             continue
         parameter = model.parameter(name)
-        if not parameter.minimum <= value <= parameter.maximum:
+        if value < parameter.minimum or value > parameter.maximum:  # no number is no finite one
             limits = f"{parameter.minimum:g} .. {parameter.maximum:g} {parameter.unit}"
             problem = f"{value:g} is outside the physical limits of {name}, {limits}"
             cure = "write a value within them, or search it: leave it out here"
