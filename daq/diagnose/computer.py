@@ -44,7 +44,8 @@ def diagnose(ports: Sequence[PortFacts] | None, out: Path, wakes: int = WAKES) -
     """
     checks = [check for port in ports or () for check in _port(port)]
     if ports is not None and not ports:
-        checks = [Check("ports", "could be better", "there are none", "plug the device in")]
+        cure = "plug the device in, if your rig is on one; a simulated rig needs none"
+        checks = [Check("ports", "could be better", "there are none", cure)]
     return [*checks, *_real_time(wakes), _disk(out)]
 
 

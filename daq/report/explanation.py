@@ -13,6 +13,7 @@ from sysid import ProcessModel
 _ENDED = {
     "generations": "it ended with the budget given",
     "converged": "it ended where nothing better came any more",
+    "settled": "it ended early, for no better minimum was to be expected",
     "interrupted": "it was interrupted",
 }
 

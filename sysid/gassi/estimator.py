@@ -146,7 +146,8 @@ class GASSI(RecordEstimator):
     search_error_ : the lowest error before local refinement.
     feasible_ : whether all constraints hold.
     history_ : (n_generations,), the best error after each ``population`` simulations.
-    stopped_ : ``generations``, ``converged`` or ``interrupted``.
+    stopped_ : ``generations``, ``converged`` (its termination ratio), ``settled`` (no other minimum
+        was to be expected) or ``interrupted``.
     flagged_ : {status name: count} of simulations that failed during the search.
     excerpt_ : the ``Excerpt`` of long records that the search went by, and the fit as well where
         it is ``cut``; None where it was all.
@@ -294,7 +295,9 @@ class GASSI(RecordEstimator):
         finally:
             if checkpoints is not None:
                 checkpoints.flush()
-        return "converged" if run.search.converged else "generations"
+        if run.search.converged:
+            return "converged"
+        return "settled" if len(run.history) < self.generations else "generations"
 
     def _search_held(
         self,
