@@ -163,7 +163,9 @@ def test_a_plot_that_cannot_be_is_refused(command, loop, plot, known, message):
     before = sorted(folder.iterdir())
     result = command(["check", "loop.yaml", "--plot", plot], folder)
     assert result.returncode == 2 and "Traceback" not in result.stderr
-    said = result.stderr.replace(f"{folder}/", "").replace(str(folder.resolve()) + "/", "")
+    said = result.stderr.replace(os.sep, "/")
+    for where in (folder, folder.resolve()):
+        said = said.replace(f"{where.as_posix()}/", "")
     assert message in said
     assert sorted(folder.iterdir()) == before
 

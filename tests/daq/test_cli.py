@@ -67,8 +67,8 @@ def test_help_of_each_command_has_an_example(tmp_path, command):
 def test_the_installed_command_is_the_module(tmp_path):
     script = Path(sys.executable).with_name("rig")
     installed = subprocess.run(
-        [script, "models"], cwd=tmp_path, env=environment(), capture_output=True, text=True,
-        check=True,
+        [script, "models"], cwd=tmp_path, env=environment(), capture_output=True,
+        encoding="utf-8", check=True,
     )  # fmt: skip
     assert installed.stdout == rig("models", cwd=tmp_path).stdout
     version = re.search(r'^version = "(.+)"', PROJECT.read_text(), re.M)[1]
