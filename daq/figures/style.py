@@ -130,6 +130,23 @@ def stack(
     return figure, panels
 
 
+def split(panels: Sequence[Axes], share: float, gap: float = 0.14) -> list[Axes]:
+    """Give a share of each panel's width to a further one beside it, of the same heights.
+
+    gap: inches between them. The further ones share their horizontal axis.
+    """
+    beside: list[Axes] = []
+    for panel in panels:
+        figure, box = panel.get_figure(root=True), panel.get_position()
+        assert figure is not None
+        width = share * box.width
+        panel.set_position((box.x0, box.y0, box.width - width - gap / WIDTH, box.height))
+        place = (box.x1 - width, box.y0, width, box.height)
+        beside.append(figure.add_axes(place, sharex=beside[0] if beside else None, sharey=panel))
+        beside[-1].tick_params(labelleft=False, labelbottom=panel is panels[-1])
+    return beside
+
+
 def name_y(panel: Axes, name: str, unit: str) -> None:
     """Label of a vertical axis, ``name [unit]``, wrapped to the panel's height.
 

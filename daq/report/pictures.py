@@ -18,7 +18,8 @@ from daq.figures import style
 from daq.figures.bode import ComplexArray, bode
 from daq.figures.findings import plot
 from daq.figures.parameters import convergence, correlation, intervals, ranges
-from daq.figures.signals import Panel, overlaid, residual_correlations, responses, signals, spectra
+from daq.figures.responses import closer_sentence, responses
+from daq.figures.signals import Panel, overlaid, residual_correlations, signals, spectra
 from daq.files import write_whole
 from daq.findings import Axis
 from daq.identification.records import LoggedRecord
@@ -129,13 +130,14 @@ def _responses(
         which = f"{log.name}, {word}" if word else log.name
         for first in range(0, len(outputs), _OUTPUTS_A_FIGURE):
             shown = range(first, min(first + _OUTPUTS_A_FIGURE, len(outputs)))
+            panels = [_response(outputs[j], log, simulated, j) for j in shown]
             more = f"from-{outputs[first].name}" if first else ""
             yield Picture(
                 _stem(part, word, more), "responses",
                 f"{data} in the fit ({which}). Measured outputs, the identified model{against} "
                 "simulated freely from the inputs alone, and below each the residual"
-                f"{', measured minus simulated' if validation else ''}.",
-                responses(log.time, [_response(outputs[j], log, simulated, j) for j in shown]),
+                f"{', measured minus simulated' if validation else ''}.{closer_sentence(panels)}",
+                responses(log.time, panels),
             )  # fmt: skip
 
 
