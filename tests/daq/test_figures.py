@@ -1,6 +1,7 @@
 """Figures: every axis says what it shows and in which unit, nothing is cut, files are of a kind."""
 
 import datetime
+import itertools
 import re
 import xml.etree.ElementTree as ET
 
@@ -239,6 +240,18 @@ def test_what_can_be_read_and_what_is_noise_have_no_closer_look():
     assert len(responses(TIME, [slow]).axes) == 2
     assert len(responses(DENSE_TIME, dense()[1:]).axes) == 2
     assert closer_sentence([slow]) == "" and "closer" in closer_sentence(dense())
+
+
+@pytest.mark.parametrize("n", [4, 12, 19, 40])
+def test_names_of_correlated_parameters_do_not_overlap(n):
+    names = [f"omega_d{k}" for k in range(n)]
+    figure = correlation(names, np.eye(n))
+    figure.draw_without_rendering()
+    panel = figure.axes[0]
+    for labels in (panel.get_xticklabels(), panel.get_yticklabels()):
+        boxes = [label.get_window_extent() for label in labels]
+        assert len(boxes) == n
+        assert not any(a.overlaps(b) for a, b in itertools.pairwise(boxes))
 
 
 def test_phases_go_on_beyond_a_turn_and_what_may_be_noise_is_left_out():

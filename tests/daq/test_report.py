@@ -13,8 +13,9 @@ from scipy.signal import lfilter
 
 from daq.errors import ConfigError
 from daq.identification import records as datasets
+from daq.identification.rows import Rows
 from daq.logs.capture import RUN_NAME
-from daq.report.pictures import _loops
+from daq.report.pictures import _loops, _parameters
 from sim_rig.actuator import actuator
 from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
 from tests.daq.support import few_free, forked_rig, only_capture, write_experiment
@@ -342,6 +343,22 @@ def test_the_ends_of_amplifiers_are_named_with_what_rests_on_them(command, captu
     (sentence,) = actuator(limits=True).assumptions
     assert sentence in said and sentence in " ".join(result.stdout.split())
     assert (root / "limited" / "figures" / "hysteresis.svg").exists()
+
+
+def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captured):
+    root = captured.parent
+    (root / "tied.yaml").write_text(yaml.safe_dump(few_free("R_m", "alpha0", "alpha1", "A")))
+    words = ("--model", "actuator", "--config", "tied.yaml", "--out", "tied")
+    result = command(("identify", captured, *words), root, report=True)
+    assert result.returncode == 0, result.stderr
+    page = (root / "tied" / "report.html").read_text()
+    assert re.search(r'data-quantity="[^"]*z\(0\)', page)
+    assert "Of 1 start of states in the logs the table has the intervals." in page
+    rows = Rows.of(json.loads((root / "tied" / "report.json").read_text()))
+    figure = next(p.figure for p in _parameters(rows) if p.name == "intervals")
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert any("alpha" in label for label in labels)
+    assert not any("(0)" in label for label in labels)
 
 
 def test_the_command_line_refuses_it_too(command, captured, record):
