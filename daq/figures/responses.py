@@ -10,15 +10,13 @@ from matplotlib.figure import Figure
 
 from daq import notation
 from daq.figures import style
-from daq.figures.signals import Panel
-from daq.figures.stretch import busiest_stretch
+from daq.figures.signals import Panel, closer_look, with_closer
 from daq.hal import FloatArray
 
 _INSIDE = 0.04  # of a frame's height, from its edge to what marks a curve beyond
 _PLAIN = 1e-2, 1e4  # sizes whose numbers need no power of ten
 _MARKS = 15  # of a curve beyond its frame, at most about so many at an edge
 _EXCESS = 4.0  # times the first model's residual that another's is drawn to
-_CLOSER = 0.4  # of the width, for the closer look
 # Of the first simulated line and the second; further ones have colours of their own.
 _LOOKS: tuple[dict[str, Any], ...] = (
     {"color": style.IDENTIFIED, "lw": 0.8, "zorder": 3},
@@ -35,12 +33,7 @@ def responses(time: FloatArray, outputs: Sequence[Panel]) -> Figure:
     """
     heights, gaps = [0.78, 0.4] * len(outputs), ([0.06, 0.26] * len(outputs))[:-1]
     figure, axes = style.stack(heights, gaps, top=0.36)
-    stretch, views = closer_look(outputs), [(slice(None), axes)]
-    if stretch is not None:
-        views.append((stretch, style.split(axes, _CLOSER)))
-        for panel in axes:
-            ends = time[stretch][[0, -1]]
-            panel.axvspan(*ends, color=style.FAINT, alpha=0.6, lw=0.0, zorder=0.5)
+    views = with_closer(time, axes, closer_look(outputs))
     leaves = [
         _respond(time, output, [(part, panels[2 * j], panels[2 * j + 1]) for part, panels in views])
         for j, output in enumerate(outputs)
@@ -51,18 +44,6 @@ def responses(time: FloatArray, outputs: Sequence[Panel]) -> Figure:
         panels[-1].set_xlabel("time [s]")
     style.legend(figure, axes[0])
     return figure
-
-
-def closer_look(outputs: Sequence[Panel]) -> slice | None:
-    """Samples that ``responses`` draws closer beside the whole; None where all is legible."""
-    return busiest_stretch([next(iter(output.lines.values())) for output in outputs])
-
-
-def closer_sentence(outputs: Sequence[Panel]) -> str:
-    """What a caption says of it, with a space before; empty where there is none."""
-    if closer_look(outputs) is None:
-        return ""
-    return " Beside them, closer, the stretch marked grey, in which the outputs move most."
 
 
 def _respond(time: FloatArray, output: Panel, views: Sequence[tuple[slice, Axes, Axes]]) -> bool:

@@ -10,9 +10,11 @@ from matplotlib.figure import Figure
 
 from daq import notation
 from daq.figures import style
+from daq.figures.stretch import busiest_stretch
 from daq.hal import FloatArray
 
 _DEEPEST = 1e-4  # of the largest line: what is below it is rounding or leakage
+_CLOSER = 0.4  # of the width, for the closer look
 _FEW = 200  # lines that are drawn one by one
 
 
@@ -31,22 +33,53 @@ class Panel:
     note: str = ""
 
 
+def closer_look(panels: Sequence[Panel]) -> slice | None:
+    """Samples that are drawn closer beside the whole; None where all of it is legible."""
+    return busiest_stretch([next(iter(panel.lines.values())) for panel in panels])
+
+
+def closer_sentence(panels: Sequence[Panel]) -> str:
+    """What a caption says of it, with a space before; empty where there is none."""
+    if closer_look(panels) is None:
+        return ""
+    return " Beside it, closer, the stretch marked grey, in which these signals move most."
+
+
+def with_closer(
+    time: FloatArray, axes: Sequence[Axes], stretch: slice | None
+) -> list[tuple[slice, Sequence[Axes]]]:
+    """Samples and the panels that show them: all, and a stretch beside it that is marked grey."""
+    views: list[tuple[slice, Sequence[Axes]]] = [(slice(None), axes)]
+    if stretch is not None:
+        views.append((stretch, style.split(axes, _CLOSER)))
+        ends = time[stretch][[0, -1]]
+        for panel in axes:
+            panel.axvspan(*ends, color=style.FAINT, alpha=0.6, lw=0.0, zorder=0.5)
+    return views
+
+
 @style.styled
 def signals(time: FloatArray, panels: Sequence[Panel]) -> Figure:
-    """Panels over one time axis [s], (n_samples,); ``asked`` is drawn behind what came of it."""
+    """Panels over one time axis [s], (n_samples,); ``asked`` is drawn behind what came of it.
+
+    Of a record that swings too often to be read, ``closer_look`` is drawn beside it.
+    """
     several = [panel for panel in panels if any(panel.lines)]
     figure, axes = style.stack([0.62] * len(panels), 0.13, top=0.2 if several else 0.1)
+    views = with_closer(time, axes, closer_look(panels))
+    for part, beside in views:
+        for axis, panel in zip(beside, panels, strict=True):
+            for name, values in panel.lines.items():
+                behind = name == "asked"
+                axis.plot(
+                    *style.thinned(time[part], values[part]), label=name or None,
+                    color=style.ASKED if behind else style.MEASURED, lw=1.8 if behind else 0.8,
+                    drawstyle="steps-post" if panel.steps else "default",
+                )  # fmt: skip
+            axis.margins(x=0.01)
+        beside[-1].set_xlabel("time [s]")
     for axis, panel in zip(axes, panels, strict=True):
-        for name, values in panel.lines.items():
-            behind = name == "asked"
-            axis.plot(
-                *style.thinned(time, values), label=name or None,
-                color=style.ASKED if behind else style.MEASURED, lw=1.8 if behind else 0.8,
-                drawstyle="steps-post" if panel.steps else "default",
-            )  # fmt: skip
         style.name_y(axis, notation.words(panel.name), notation.bracketed(panel.unit))
-        axis.margins(x=0.01)
-    axes[-1].set_xlabel("time [s]")
     if several:
         style.legend(figure, axes[panels.index(several[0])])
     return figure

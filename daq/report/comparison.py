@@ -9,8 +9,8 @@ import numpy as np
 
 from daq.documents import plain
 from daq.figures.parameters import ratios
-from daq.figures.responses import closer_sentence, responses
-from daq.figures.signals import Panel
+from daq.figures.responses import responses
+from daq.figures.signals import Panel, closer_sentence
 from daq.files import write_whole
 from daq.identification.comparison import ComparisonResult
 from daq.lookup.models import trust_option

@@ -18,8 +18,15 @@ from daq.figures import style
 from daq.figures.bode import ComplexArray, bode
 from daq.figures.findings import plot
 from daq.figures.parameters import convergence, correlation, intervals, ranges
-from daq.figures.responses import closer_sentence, responses
-from daq.figures.signals import Panel, overlaid, residual_correlations, signals, spectra
+from daq.figures.responses import responses
+from daq.figures.signals import (
+    Panel,
+    closer_sentence,
+    overlaid,
+    residual_correlations,
+    signals,
+    spectra,
+)
 from daq.files import write_whole
 from daq.findings import Axis
 from daq.identification.records import LoggedRecord
@@ -194,10 +201,14 @@ def _before_and_after(subject: Subject, log: LoggedRecord, part: tuple[float, fl
 
 def _excitation(subject: Subject) -> Iterator[Picture]:
     log = subject.training[0][0]
+    time, panels = (
+        _foreign_signals(subject.model, log.dataset) if subject.foreign else _capture_signals(log)
+    )
     yield Picture(
         "signals", "excitation",
-        f"What was commanded and measured in the training log {log.dataset.name}.",
-        _foreign_signals(subject.model, log.dataset) if subject.foreign else _capture_signals(log),
+        f"What was commanded and measured in the training log {log.dataset.name}."
+        f"{closer_sentence(panels)}",
+        signals(time, panels),
     )  # fmt: skip
 
 
@@ -524,19 +535,19 @@ def _stem(*words: str) -> str:
     return "-".join(re.sub(r"[^\w.]+", "-", word) for word in words if word)
 
 
-def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:
-    """The model's inputs and outputs in a foreign log."""
+def _foreign_signals(model: ProcessModel, data: Dataset) -> tuple[FloatArray, list[Panel]]:
+    """Time and panels of the model's inputs and outputs in a foreign log."""
     panels = [
         Panel(signal.name, signal.unit, {"": values}, steps=signal.hold == "zoh")
         for signal, values in zip(model.inputs, data.inputs.T, strict=True)
     ]
     measured = zip(model.outputs, data.outputs.T, strict=True)
     panels += [Panel(signal.name, signal.unit, {"": values}) for signal, values in measured]
-    return signals(data.time, panels)
+    return data.time, panels
 
 
-def _capture_signals(log: LoggedRecord) -> Figure:
-    """All columns of a capture: commands as asked and as applied, then the sensors."""
+def _capture_signals(log: LoggedRecord) -> tuple[FloatArray, list[Panel]]:
+    """Time and panels of a capture: commands as asked and as applied, then the sensors."""
     columns = _columns(log)
     panels: list[Panel] = []
     for name, unit in UNITS.items():
@@ -546,7 +557,7 @@ def _capture_signals(log: LoggedRecord) -> Figure:
             panels.append(Panel(channel, unit, lines, steps=True))
         elif name != "t" and not name.startswith("applied_"):
             panels.append(Panel(name, unit, {"": columns[name]}))
-    return signals(columns["t"], panels)
+    return columns["t"], panels
 
 
 def _columns(log: LoggedRecord) -> dict[str, FloatArray]:

@@ -14,8 +14,8 @@ from daq.figures.bode import bode
 from daq.figures.findings import draw, plot
 from daq.figures.history import Overlay, Trend, history
 from daq.figures.parameters import convergence, correlation, intervals, ranges, ratios
-from daq.figures.responses import closer_sentence, responses
-from daq.figures.signals import Panel, signals, spectra
+from daq.figures.responses import responses
+from daq.figures.signals import Panel, closer_sentence, signals, spectra
 from daq.findings import Axis, Chart, Heatmap, Series
 
 TIME = np.linspace(0.0, 1.0, 400)
@@ -75,6 +75,7 @@ def drawn():
             Panel(NASTY, "1", {"measured": WAVE, "identified": WAVE}),
         ]),
         "dense": responses(DENSE_TIME, dense()),
+        "dense signals": signals(DENSE_TIME, dense()),
         "convergence": convergence(np.array([0.5, 0.2, 0.11]), 300, 0.2),
         "ranges": ranges(["K_m", NASTY], places, ["", "only together"]),
         "intervals": intervals(["A alpha0", "k"], ends),
@@ -107,8 +108,8 @@ def figures():
 
 
 NAMES = [
-    "signals", "responses", "dense", "convergence", "ranges", "intervals", "correlation", "spectra",
-    "bode", "loops", "points", "chart", "plane", "crowd", "ratios",
+    "signals", "responses", "dense", "dense signals", "convergence", "ranges", "intervals",
+    "correlation", "spectra", "bode", "loops", "points", "chart", "plane", "crowd", "ratios",
 ]  # fmt: skip
 
 
