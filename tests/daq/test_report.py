@@ -343,6 +343,8 @@ def test_the_ends_of_amplifiers_are_named_with_what_rests_on_them(command, captu
     (sentence,) = actuator(limits=True).assumptions
     assert sentence in said and sentence in " ".join(result.stdout.split())
     assert (root / "limited" / "figures" / "hysteresis.svg").exists()
+    replayed = command(("replay", captured, "--parameters", "limited"), root)
+    assert "through actuator:limits=true with the parameters of limited" in replayed.stdout
 
 
 def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captured):
