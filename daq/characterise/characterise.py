@@ -64,8 +64,7 @@ class Characterisation(Shown):
     def headline(self) -> str:
         """Rounds, logged time, and why it ended."""
         rounds = f"{len(self.rounds)} round{'s' * (len(self.rounds) != 1)}"
-        spent = f"{rounds}, {self.seconds:.3g} s logged in {self.folder}"
-        return f"{self.rounds[-1].model} after {spent}: {self.reason}"
+        return f"{rounds}, {self.seconds:.3g} s logged in {self.folder}: {self.reason}"
 
     @property
     def assumptions(self) -> list[str]:
