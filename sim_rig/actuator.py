@@ -193,6 +193,9 @@ class _Assembly:
             operating_points=operating_points,
             regressors=regressors,
             equations=self._equations(),
+            assumptions=electrical.limit_assumptions(
+                design.limits, design.driver_brake, design.output_resistance_brake
+            ),
         )
 
     def _derivative(self, shaft: _Shaft) -> Callable[..., tuple[Any, ...]]:
@@ -290,7 +293,7 @@ class _Assembly:
     def _equations(self) -> tuple[str, ...]:
         """The equations as text, for people: one line each, in the parameters' names.
 
-        Between the limits of the amplifiers; a test evaluates them against the functions.
+        A test evaluates them against the functions.
         Currents, voltages and commands have the symbols of the thesis, i, v and u with an index
         m (motor) or b (brake).
         """
@@ -304,10 +307,14 @@ class _Assembly:
             inertia, torque = f"{inertia} + J_load", f"{torque} + tau_load"
             of_load = ("tau_load and J_load: torque and inertia of the load",)
         return (
-            *electrical.driver_equations(design.driver_motor, design.order_motor, "m"),
-            *electrical.driver_equations(design.driver_brake, design.order_brake, "b"),
+            *electrical.driver_equations(
+                design.driver_motor, design.order_motor, "m", design.limits
+            ),
+            *electrical.driver_equations(
+                design.driver_brake, design.order_brake, "b", design.limits
+            ),
             *electrical.winding_equations(
-                design.output_resistance_motor, design.output_resistance_brake
+                design.output_resistance_motor, design.output_resistance_brake, design.limits
             ),
             *self._hysteresis.equations,
             *filter(None, [brushes]),
@@ -315,6 +322,7 @@ class _Assembly:
             "dtheta/dt = omega",
             "u: commands, v: voltages and i: currents of motor (m) and brake (b); z: hysteresis; "
             "theta: angle",
+            *electrical.limit_equations(design.limits),
             *of_load,
         )
 
@@ -338,6 +346,8 @@ def _description(design: Design) -> str:
     drivers = f"{motor[0]} drivers{motor[1]}"
     if motor != brake:
         drivers = f"{motor[0]} motor driver{motor[1]} and {brake[0]} brake driver{brake[1]}"
+    if design.limits:
+        drivers += f" that end at {electrical.SUPPLY:g} V and {electrical.MAX_CURRENT:g} A"
     kind = {"bouc-wen": "Bouc-Wen", "dahl": "Dahl", "lugre": "LuGre"}[design.hysteresis]
     hysteresis = (
         f"magnetorheological brake with {'smooth ' if design.smooth else ''}{kind} hysteresis"

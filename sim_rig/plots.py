@@ -161,7 +161,7 @@ class _DrivenShaft:
         place, shape = self.model.state_names.index(name), x["z"].shape
         try:
             slope = self.model.derivative(tuple(x.values()), u, tuple(p))[place]
-        except TypeError:  # of functions that take one number, as math.exp does
+        except (TypeError, ValueError):  # of functions of one number, as math.exp, min and max
             numbers = np.array([np.broadcast_to(v, shape) for v in (*x.values(), *p)])
             rows = [tuple(row) for row in numbers.reshape(len(numbers), -1).T.tolist()]
             slope = np.array(

@@ -66,6 +66,11 @@ class Characterisation(Shown):
         rounds = f"{len(self.rounds)} round{'s' * (len(self.rounds) != 1)}"
         return f"{rounds}, {self.seconds:.3g} s logged in {self.folder}: {self.reason}"
 
+    @property
+    def assumptions(self) -> list[str]:
+        """What values rest on that is not estimated, in sentences."""
+        return list(self.rounds[-1].result.get("assumptions", []))
+
     def lines(self) -> Lines:
         """Quantities with the half widths of their 95 % intervals."""
         rows = [["quantity", "value", "half width [%]", "expected [%]"]]
@@ -80,6 +85,8 @@ class Characterisation(Shown):
         """The same for machines."""
         return {
             "folder": str(self.folder),
+            "model": self.rounds[-1].model,
+            "assumptions": self.assumptions,
             "rounds": len(self.rounds),
             "logged_seconds": self.seconds,
             "ended": self.reason,

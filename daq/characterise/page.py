@@ -29,6 +29,8 @@ def write_page(root: Path, rounds: Sequence[Round], reason: str) -> Path:
     seconds = np.cumsum([each.seconds for each in rounds])
     document = plain(
         {
+            "model": rounds[-1].model,
+            "assumptions": rounds[-1].result.get("assumptions", []),
             "ended": reason,
             "logged_seconds": float(seconds[-1]),
             "verdict": rounds[-1].result["verdict"],

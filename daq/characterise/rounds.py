@@ -20,6 +20,7 @@ from daq.files import make_folder, write_whole
 from daq.identification.earlier_fit import EarlierFit
 from daq.identification.request import PARAMETERS
 from daq.logs.capture import COMPLETED, INTERLOCK, RUN_NAME
+from daq.lookup.models import without_folders
 from sysid import EarlierMinima
 
 _REQUEST = "characterise.json"
@@ -174,6 +175,12 @@ class Round:
     def result(self) -> dict[str, Any]:
         """The result's document."""
         return yaml_file.load(self.identification / PARAMETERS).content
+
+    @property
+    def model(self) -> str:
+        """The model's name, as one types it where its file is."""
+        name = str(self.result["model"])
+        return without_folders([name])[name]
 
     def intervals(self, result: Mapping[str, Any] | None = None) -> list[Interval]:
         """All that experiments can tell, after this round; result: one not yet written."""

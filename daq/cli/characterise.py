@@ -110,9 +110,11 @@ def _show(result: Characterisation) -> None:
     print()
     n = len(result.rounds)
     spent = f"{result.seconds:g} s in {n} round{'s' * (n != 1)}"
-    title = f"After {spent}: 95 % intervals in % of the value"
+    title = f"{result.rounds[-1].model} after {spent}: 95 % intervals in % of the value"
     head = ["quantity", "value", "unit", "half width", "expected"]
     terminal.print_table(title, head, rows, text=["unit"])
+    for assumption in result.assumptions:
+        terminal.print_text(assumption)
     terminal.print_text(f"It ended because {result.reason}.")
     print_verdict(result.verdict)
     print(f"Page: {result.page}")

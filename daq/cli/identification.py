@@ -95,6 +95,9 @@ def _show(result: Identification) -> None:
         terminal.print_text(f"{name} searched as the data suggest: {guess.source}.")
     if rows.refined:
         _show_open_questions(rows)
+    for assumption in result.model.assumptions:
+        terminal.print_text(assumption)
+        print()
     _show_profiles(result.profiles)
     _show_errors(rows)
     _show_residuals(rows, any(log.log.dataset.input_noise.any() for log in result.training))
@@ -125,7 +128,7 @@ def _show_parameters(result: Identification) -> None:
     # Ranges that all come from the model need no column that says so.
     shown[head.index("from")] = any(row.source != "model" for row in result.rows.parameters)
     head, *rows = (list(itertools.compress(cells, shown)) for cells in (head, *rows))
-    title = f"Parameters of {result.model.name}"
+    title = f"Parameters of {result.title}"
     terminal.print_table(title, head, rows, text=["unit", "from", ""])
 
 

@@ -77,7 +77,7 @@ def _identifiable(name: str | None, config: Path | None, settings: list[str], js
 
 def _show_identifiable(structure: Structure) -> None:
     model, result = structure.model, structure.identifiability
-    terminal.print_text(f"{model.name}: {model.description}")
+    terminal.print_text(f"{structure.title}: {model.description}")
     measured = f"Measured: {', '.join(result.outputs)}."
     if result.unknown_starts:
         measured += f" Unknown at the start of a record: {', '.join(result.unknown_starts)}."
@@ -94,6 +94,9 @@ def _show_identifiable(structure: Structure) -> None:
     for group in result.tied:
         print()
         _show_group(group)
+    for assumption in model.assumptions:
+        print()
+        terminal.print_text(assumption)
     if result.tied:
         print()
         if math.isfinite(result.gap):
@@ -163,10 +166,14 @@ def _sizes(model: ProcessModel) -> list[str]:
 
 
 def _show(name: str, model: ProcessModel, options: list[dict[str, Any]]) -> None:
-    terminal.print_text(f"{model.name}: {model.description}")
+    from daq.lookup.models import title_of
+
+    terminal.print_text(f"{title_of(name, model)}: {model.description}")
     for equation in model.equations:
         terminal.print_text(f"  {equation}")
-    if model.equations:
+    for assumption in model.assumptions:
+        terminal.print_text(assumption)
+    if model.equations or model.assumptions:
         print()
     rows = [["state", s.name, s.unit, _start(s, model)] for s in model.states]
     rows += [["input", s.name, s.unit, s.hold] for s in model.inputs]

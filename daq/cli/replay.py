@@ -107,7 +107,7 @@ def _document(result: Replay, bounds: Mapping[str, float]) -> dict[str, Any]:
     from daq.identification.result import errors_document
 
     return {
-        "model": result.model.name,
+        "model": result.model_title,
         "parameters": result.source,
         "outputs": errors_document(result.model, result.metrics),
         "passed": not result.below(bounds),

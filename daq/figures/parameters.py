@@ -11,8 +11,10 @@ from daq.figures import style
 from daq.hal import FloatArray
 
 _NUMBERED = 0.27  # in, width of a cell from which its correlation is written into it
+_FRAME = 1.1  # of the width drawn, to which the panel reaches
 _WIDEST = 8.0  # times the median width to which intervals are drawn
-_SHORT = 9  # letters up to which names stand beside each other
+_BESIDE = 0.9  # of a cell's width up to which names stand beside each other
+_TALLEST = 60.0  # points of a label's letters in an inch of its row
 _NAME = 52  # letters of a model's name above its row
 
 
@@ -87,12 +89,12 @@ def intervals(names: Sequence[str], values: FloatArray) -> Figure:
             0.0, row, xerr=[[abs(below)], [abs(above)]], fmt="o", ms=3.0, capsize=2.0,
             color=style.IDENTIFIED, ecolor=style.BASELINE, elinewidth=1.2, capthick=0.8,
         )  # fmt: skip
-        if widths[row] > limit:
+        if widths[row] > _FRAME * limit:
             shown = f"{below:.0f} .. +{above:.0f} %".replace("-", "−")
             panel.text(limit, row - 0.1, shown, ha="right", va="bottom", fontsize=6.0)
     panel.axvline(0.0, color="black", lw=0.4, zorder=1)
     _name_rows(panel, labels)
-    panel.set_xlim(-1.1 * limit, 1.1 * limit) if limit > 0.0 else None
+    panel.set_xlim(-_FRAME * limit, _FRAME * limit) if limit > 0.0 else None
     panel.set_xlabel("95 % interval, distance from the value [%]")
     return figure
 
@@ -111,17 +113,18 @@ def correlation(names: Sequence[str], matrix: FloatArray) -> Figure:
     n = len(names)
     labels, left = style.row_names(names)
     right = 0.72
-    upright = max(len(name) for name in names) > _SHORT
     side = style.WIDTH - left - right
+    longest = max(map(style.text_width, labels))
+    upright = longest > _BESIDE * side / n
     figure, (panel,) = style.stack(
-        [side], left=left, right=right, top=0.12, bottom=left if upright else 0.3
+        [side], left=left, right=right, top=0.12, bottom=longest + 0.14 if upright else 0.3
     )
     # Orange to violet keeps its order for readers who confuse red and green.
     image = panel.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)
     panel.set_xticks(range(n), labels, rotation=90 if upright else 0)
     panel.set_yticks(range(n), labels)
     panel.grid(visible=False)
-    panel.tick_params(length=0)
+    panel.tick_params(length=0, labelsize=min(style.TICK_LABEL, _TALLEST * side / n))
     panel.spines[:].set_visible(False)
     if side / n >= _NUMBERED:
         for i, j in np.argwhere(np.isfinite(matrix)).tolist():

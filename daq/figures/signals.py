@@ -1,6 +1,5 @@
 """Signals over time and their spectra: planned, recorded, simulated, left in the residuals."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,19 +10,12 @@ from matplotlib.figure import Figure
 
 from daq import notation
 from daq.figures import style
+from daq.figures.stretch import busiest_stretch
 from daq.hal import FloatArray
 
 _DEEPEST = 1e-4  # of the largest line: what is below it is rounding or leakage
+_CLOSER = 0.4  # of the width, for the closer look
 _FEW = 200  # lines that are drawn one by one
-_INSIDE = 0.04  # of a frame's height, from its edge to what marks a curve beyond
-_PLAIN = 1e-2, 1e4  # sizes whose numbers need no power of ten
-_MARKS = 15  # of a curve beyond its frame, at most about so many at an edge
-_EXCESS = 4.0  # times the first model's residual that another's is drawn to
-# Of the first simulated line and the second; further ones have colours of their own.
-_LOOKS: tuple[dict[str, Any], ...] = (
-    {"color": style.IDENTIFIED, "lw": 0.8, "zorder": 3},
-    {"color": style.BASELINE, "lw": 0.6, "zorder": 2, "ls": (0, (3, 1))},
-)
 
 
 @dataclass(frozen=True)
@@ -41,22 +33,53 @@ class Panel:
     note: str = ""
 
 
+def closer_look(panels: Sequence[Panel]) -> slice | None:
+    """Samples that are drawn closer beside the whole; None where all of it is legible."""
+    return busiest_stretch([next(iter(panel.lines.values())) for panel in panels])
+
+
+def closer_sentence(panels: Sequence[Panel]) -> str:
+    """What a caption says of it, with a space before; empty where there is none."""
+    if closer_look(panels) is None:
+        return ""
+    return " Beside it, closer, the stretch marked grey, in which these signals move most."
+
+
+def with_closer(
+    time: FloatArray, axes: Sequence[Axes], stretch: slice | None
+) -> list[tuple[slice, Sequence[Axes]]]:
+    """Samples and the panels that show them: all, and a stretch beside it that is marked grey."""
+    views: list[tuple[slice, Sequence[Axes]]] = [(slice(None), axes)]
+    if stretch is not None:
+        views.append((stretch, style.split(axes, _CLOSER)))
+        ends = time[stretch][[0, -1]]
+        for panel in axes:
+            panel.axvspan(*ends, color=style.FAINT, alpha=0.6, lw=0.0, zorder=0.5)
+    return views
+
+
 @style.styled
 def signals(time: FloatArray, panels: Sequence[Panel]) -> Figure:
-    """Panels over one time axis [s], (n_samples,); ``asked`` is drawn behind what came of it."""
+    """Panels over one time axis [s], (n_samples,); ``asked`` is drawn behind what came of it.
+
+    Of a record that swings too often to be read, ``closer_look`` is drawn beside it.
+    """
     several = [panel for panel in panels if any(panel.lines)]
     figure, axes = style.stack([0.62] * len(panels), 0.13, top=0.2 if several else 0.1)
+    views = with_closer(time, axes, closer_look(panels))
+    for part, beside in views:
+        for axis, panel in zip(beside, panels, strict=True):
+            for name, values in panel.lines.items():
+                behind = name == "asked"
+                axis.plot(
+                    *style.thinned(time[part], values[part]), label=name or None,
+                    color=style.ASKED if behind else style.MEASURED, lw=1.8 if behind else 0.8,
+                    drawstyle="steps-post" if panel.steps else "default",
+                )  # fmt: skip
+            axis.margins(x=0.01)
+        beside[-1].set_xlabel("time [s]")
     for axis, panel in zip(axes, panels, strict=True):
-        for name, values in panel.lines.items():
-            behind = name == "asked"
-            axis.plot(
-                *style.thinned(time, values), label=name or None,
-                color=style.ASKED if behind else style.MEASURED, lw=1.8 if behind else 0.8,
-                drawstyle="steps-post" if panel.steps else "default",
-            )  # fmt: skip
         style.name_y(axis, notation.words(panel.name), notation.bracketed(panel.unit))
-        axis.margins(x=0.01)
-    axes[-1].set_xlabel("time [s]")
     if several:
         style.legend(figure, axes[panels.index(several[0])])
     return figure
@@ -80,102 +103,6 @@ def overlaid(times: tuple[FloatArray, FloatArray], panels: Sequence[Panel]) -> F
     axes[-1].set_xlabel("time [s]")
     style.legend(figure, axes[0])
     return figure
-
-
-@style.styled
-def responses(time: FloatArray, outputs: Sequence[Panel]) -> Figure:
-    """Each output's response and, at its own scale below, measured minus simulated.
-
-    Of each panel's lines the first is the measured one, the second of the model that the figure
-    is about.
-    """
-    heights, gaps = [0.78, 0.4] * len(outputs), ([0.06, 0.26] * len(outputs))[:-1]
-    figure, axes = style.stack(heights, gaps, top=0.36)
-    leaves = [
-        _respond(time, output, axes[2 * j], axes[2 * j + 1]) for j, output in enumerate(outputs)
-    ]
-    if any(leaves):
-        axes[0].plot([], [], ls="", marker="^", ms=3, color="0.4", label="beyond frame")
-    axes[-1].set_xlabel("time [s]")
-    style.legend(figure, axes[0])
-    return figure
-
-
-def _respond(time: FloatArray, output: Panel, above: Axes, below: Axes) -> bool:
-    """One output's two panels; whether a curve leaves its frame."""
-    measured, *simulated = output.lines.values()
-    factor, unit = _multiple(_largest(measured), output.unit)
-    measured, simulated = factor * measured, [factor * values for values in simulated]
-    above.plot(*style.thinned(time, measured), color=style.MEASURED, lw=1.5, label="measured")
-    residuals = [measured - values for values in simulated]
-    if residuals:
-        smaller, unit_below = _multiple(_largest(residuals[0]) / factor, output.unit)
-        residuals = [smaller / factor * residual for residual in residuals]
-    else:
-        unit_below = unit
-    for k, (name, values) in enumerate(zip(list(output.lines)[1:], simulated, strict=True)):
-        look = _LOOKS[k] if k < len(_LOOKS) else {**_LOOKS[1], "color": f"C{k}"}
-        above.plot(*style.thinned(time, values), label=name, **look)
-        below.plot(*style.thinned(time, residuals[k]), **look)
-    # A model that runs away must flatten neither what was measured nor the other's residual.
-    values = np.concatenate([measured, simulated[0]])
-    values = values[np.isfinite(values)]
-    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    room = 0.06 * (high - low) or 1.2
-    above.set_ylim(low - room, high + room)
-    sizes = [_largest(residual) for residual in residuals]
-    largest = 1.06 * min(max(sizes), _EXCESS * sizes[0]) or 1.2
-    below.set_ylim(-largest, largest)
-    leaves = False
-    for panel, curves in ((above, simulated), (below, residuals)):
-        for k, curve in enumerate(curves):
-            color = str(_LOOKS[k]["color"]) if k < len(_LOOKS) else f"C{k}"
-            leaves |= _mark_leaving(panel, time, curve, color)
-    below.axhline(0.0, color="black", lw=0.4, zorder=1)
-    style.name_y(above, notation.words(output.name), unit)
-    style.name_y(below, "residual", unit_below)
-    for panel in (above, below):
-        panel.margins(x=0.01)
-    below.locator_params(axis="y", nbins=3)
-    if output.note:
-        above.set_title(output.note, loc="right", fontsize=6.5, pad=2.0)
-    return leaves
-
-
-def _multiple(largest: float, unit: str) -> tuple[float, str]:
-    """By what values are multiplied to need no power of ten at their axis; their unit there."""
-    if not math.isfinite(largest) or largest == 0.0 or _PLAIN[0] <= largest < _PLAIN[1]:
-        return 1.0, notation.bracketed(unit)
-    factor, prefixed = notation.engineering(largest, unit)
-    if factor != 1.0:
-        return factor, notation.bracketed(prefixed)
-    power = 3 * math.floor(math.log10(largest) / 3.0)
-    text = notation.unit_text(unit)
-    raised = notation.raised(str(power))
-    return 10.0**-power, f"[10{raised} {text}]" if text not in ("", "1") else f"[10{raised}]"
-
-
-def _mark_leaving(panel: Axes, time: FloatArray, values: FloatArray, color: str) -> bool:
-    """Mark each stretch of a curve beyond its frame at the edge; whether there is one."""
-    low, high = panel.get_ylim()
-    there = ~np.isnan(values)  # what is missing parts no stretch
-    time, values = time[there], values[there]
-    inside, places = _INSIDE * (high - low), list[tuple[float, float, str]]()
-    ends = ((values > high, high - inside, "^"), (values < low, low + inside, "v"))
-    for beyond, edge, marker in ends:
-        steps = np.flatnonzero(np.diff(np.concatenate([[False], beyond, [False]]).astype(int)))
-        middles = time[(steps[::2] + steps[1::2] - 1) // 2]
-        places += [(at, edge, marker) for at in middles[:: max(1, len(middles) // _MARKS)]]
-    for marker in ("^", "v"):
-        here = [(at, edge) for at, edge, kind in places if kind == marker]
-        if here:
-            panel.plot(*np.transpose(here), ls="", marker=marker, ms=2.5, color=color,
-                       clip_on=False, scalex=False, scaley=False)  # fmt: skip
-    return bool(places)
-
-
-def _largest(residual: FloatArray) -> float:
-    return float(np.max(np.abs(residual), where=np.isfinite(residual), initial=0.0))
 
 
 @style.styled

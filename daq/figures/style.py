@@ -44,6 +44,7 @@ _NAMELESS: dict[str, dict[str, Any]] = {
 WIDTH = 3.5  # in, one column
 LEFT = 0.72  # in, left of the panels
 DPI = 300
+TICK_LABEL = 6.5  # pt, also of legends
 
 MEASURED = "#4d4d4d"
 IDENTIFIED = "#d55e00"
@@ -77,8 +78,8 @@ _LAYOUT = ("GDEF", "GPOS", "GSUB")  # tables of a font
 
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans", "font.size": 7.0, "axes.labelsize": 7.0, "axes.titlesize": 7.0,
-    "xtick.labelsize": 6.5, "ytick.labelsize": 6.5,
-    "legend.fontsize": 6.5, "legend.frameon": False, "legend.handlelength": 1.6,
+    "xtick.labelsize": TICK_LABEL, "ytick.labelsize": TICK_LABEL,
+    "legend.fontsize": TICK_LABEL, "legend.frameon": False, "legend.handlelength": 1.6,
     "legend.handletextpad": 0.8, "legend.columnspacing": 1.2,
     "axes.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
     "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4", "grid.linewidth": 0.4,
@@ -128,6 +129,23 @@ def stack(
         for panel in panels[:-1]:
             panel.tick_params(labelbottom=False)
     return figure, panels
+
+
+def split(panels: Sequence[Axes], share: float, gap: float = 0.14) -> list[Axes]:
+    """Give a share of each panel's width to a further one beside it, of the same heights.
+
+    gap: inches between them. The further ones share their horizontal axis.
+    """
+    beside: list[Axes] = []
+    for panel in panels:
+        figure, box = panel.get_figure(root=True), panel.get_position()
+        assert figure is not None
+        width = share * box.width
+        panel.set_position((box.x0, box.y0, box.width - width - gap / WIDTH, box.height))
+        place = (box.x1 - width, box.y0, width, box.height)
+        beside.append(figure.add_axes(place, sharex=beside[0] if beside else None, sharey=panel))
+        beside[-1].tick_params(labelleft=False, labelbottom=panel is panels[-1])
+    return beside
 
 
 def name_y(panel: Axes, name: str, unit: str) -> None:
@@ -251,7 +269,7 @@ def _arranged(labels: Sequence[str], left: float) -> tuple[list[str], int, float
     for columns in range(len(labels), 1, -1):
         # Column by column, as matplotlib fills them.
         filled = np.array_split(np.array(labels), columns)
-        taken = sum(_HANDLE + max(_text_width(label) for label in column) for column in filled)
+        taken = sum(_HANDLE + max(text_width(label) for label in column) for column in filled)
         if taken + (columns - 1) * _BETWEEN < room:
             return list(labels), columns, 0.1 + _ROW * len(filled[0])
     shown = [_folded(label, room - _HANDLE) for label in labels]
@@ -263,13 +281,13 @@ def _folded(label: str, room: float) -> str:
     """A label on as many lines as it takes to be no wider than so many inches."""
     for letters in range(len(label), 8, -2):
         lines = textwrap.wrap(label, letters)
-        if all(_text_width(line) <= room for line in lines):
+        if all(text_width(line) <= room for line in lines):
             return "\n".join(lines)
     return "\n".join(textwrap.wrap(label, 8))
 
 
-def _text_width(text: str) -> float:
-    """Inches that a legend's text takes."""
+def text_width(text: str) -> float:
+    """Inches that the text of a legend or of a tick takes."""
     font = FontProperties(size=_SETTINGS["legend.fontsize"])
     is_math = bool(is_math_text(text))
     shown = text if is_math else text.replace(r"\$", "$")

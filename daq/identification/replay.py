@@ -20,7 +20,7 @@ from daq.identification.fit import take
 from daq.identification.request import SettingsRequest, result_file
 from daq.identification.result import Identification
 from daq.identification.settings import Problem, problem_of, reading_of, with_signals
-from daq.lookup.models import find_model
+from daq.lookup.models import find_model, title_of
 from daq.lookup.rigs import DEFAULT_RIG, load_rig
 from daq.notation import percent, quantity
 from daq.views import Lines, Shown
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 class Replay(Shown):
     """A log's inputs through a model, beside what was measured.
 
-    time: (n,) [s]. measured, simulated: (n, n_outputs) in the outputs' units. source: where the
-    parameters come from. warning: how the logged run ended if it did not complete. config: what
-    gave a model by name values that are not its own.
+    model_title: what to call the model. time: (n,) [s]. measured, simulated: (n, n_outputs) in the
+    outputs' units. source: where the parameters come from. warning: how the logged run ended if it
+    did not complete. config: what gave a model by name values that are not its own.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))
@@ -49,6 +49,7 @@ class Replay(Shown):
 
     path: Path
     model: ProcessModel
+    model_title: str
     source: str
     time: FloatArray
     measured: FloatArray
@@ -63,7 +64,7 @@ class Replay(Shown):
         if self.source.partition(":")[0] == self.model.name:
             values = "at its own values" if self.config is None else f"with values of {self.config}"
             return f"{self.source} {values}"
-        return f"{self.model.name} with the parameters of {self.source}"
+        return f"{self.model_title} with the parameters of {self.source}"
 
     @property
     def headline(self) -> str:
@@ -148,6 +149,7 @@ def replay(
         request = SettingsRequest(None if file is None else str(file), {"model": model}, settings)
         problem = problem_of(request)
         chosen, values, source = problem.model, _declared(problem), problem.model_name
+        title = title_of(source, chosen)
         under = problem.settings
         valued = file if under.fixed or under.tied or problem.given else None
         mapping, selection = problem.mapping, problem.selection
@@ -156,7 +158,7 @@ def replay(
             "a result names its own model", cure="give --parameters or --model", key="--model"
         )
     else:
-        chosen, values, source = _parameters(parameters, str(rig), trust)
+        chosen, title, values, source = _parameters(parameters, str(rig), trust)
         mapping, selection = reading_of(file, settings, chosen)
     logged = take(log, "data", chosen, mapping, selection)
     record = logged.dataset
@@ -167,7 +169,16 @@ def replay(
     time = np.arange(record.n_samples, dtype=np.float64) * record.dt
     metrics, measured = evaluate(record.outputs, simulated), record.outputs
     return Replay(
-        logged.path, chosen, source, time, measured, simulated, metrics, logged.warning, valued
+        logged.path,
+        chosen,
+        title,
+        source,
+        time,
+        measured,
+        simulated,
+        metrics,
+        logged.warning,
+        valued,
     )
 
 
@@ -201,12 +212,20 @@ def _declared(problem: Problem) -> dict[str, float]:
 
 def _parameters(
     parameters: Identification | str | Path | None, rig: str, trust: bool
-) -> tuple[ProcessModel, dict[str, float], str]:
-    """A model, its parameters, and where they come from."""
+) -> tuple[ProcessModel, str, dict[str, float], str]:
+    """A model and what to call it, its parameters, and where they come from."""
     if isinstance(parameters, Identification):
-        return parameters.model, dict(parameters.estimator.parameters_), "identification"
+        values = dict(parameters.estimator.parameters_)
+        return parameters.model, parameters.title, values, "identification"
     if parameters is not None:
-        return *read_parameters(result_file(parameters), trust), str(parameters)
+        path = result_file(parameters)
+        model, values = read_parameters(path, trust)
+        return (
+            model,
+            title_of(yaml_file.load(path).content["model"], model),
+            values,
+            str(parameters),
+        )
     _, device = load_rig(rig)
     if not isinstance(device, Simulation):
         cure = "give those of an identification with --parameters"
@@ -215,7 +234,8 @@ def _parameters(
         model = device.process_model()
     except ModelError as error:
         raise ConfigError(str(error), file=rig) from None
-    return model, dict(zip(model.parameter_names, model.nominal, strict=True)), rig
+    values = dict(zip(model.parameter_names, model.nominal, strict=True))
+    return model, model.name, values, rig
 
 
 def read_parameters(path: Path, trust: bool) -> tuple[ProcessModel, dict[str, float]]:

@@ -22,7 +22,7 @@ from daq.identification.remedies import remedies
 from daq.identification.request import PARAMETERS, resume_command
 from daq.identification.rows import Rows
 from daq.identification.settings import Problem, setting_of
-from daq.lookup.models import trust_option, without_folders
+from daq.lookup.models import title_of, trust_option, without_folders
 from daq.notation import quantity
 from daq.provenance import software_versions
 from daq.views import Lines, Shown
@@ -117,6 +117,11 @@ class Identification(Shown):
     def lines(self) -> Lines:
         """Parameters and combinations with their 95 % intervals, and fits."""
         return self.rows.lines()
+
+    @property
+    def title(self) -> str:
+        """What to call the model."""
+        return title_of(self.problem.model_name, self.model)
 
     @property
     def model(self) -> ProcessModel:
@@ -311,6 +316,11 @@ class Identification(Shown):
         profiles = {profile.name: _profile(profile) for profile in self.profiles}
         return {
             "model": self.problem.model_name,
+            **(
+                {"assumptions": list(assumptions)}
+                if (assumptions := self.model.assumptions)
+                else {}
+            ),
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
             "criterion": {

@@ -7,6 +7,7 @@ from typing import Any
 from daq.errors import ConfigError
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
+from daq.lookup.models import title_of
 from sysid import Identifiability, ModelError, ProcessModel, SearchSpace, TiedGroup, identifiability
 
 
@@ -14,9 +15,11 @@ from sysid import Identifiability, ModelError, ProcessModel, SearchSpace, TiedGr
 class Structure:
     """A model as it would be identified, and what its outputs determine of it.
 
-    ties: expressions of the parameters that the settings tie to others.
+    title: what to call the model. ties: expressions of the parameters that the settings tie to
+    others.
     """
 
+    title: str
     model: ProcessModel
     identifiability: Identifiability
     ties: Mapping[str, str]
@@ -32,7 +35,7 @@ class Structure:
         """All of it, as JSON can hold it."""
         result = self.identifiability
         return {
-            "model": self.model.name,
+            "model": self.title,
             "outputs": list(result.outputs),
             "unknown_starts": list(result.unknown_starts),
             "fixed": self.fixed,
@@ -41,6 +44,7 @@ class Structure:
             "tied": [_group(group) for group in result.tied],
             "unseen": list(result.unseen),
             "gap_decades": result.gap,
+            "assumptions": list(self.model.assumptions),
         }
 
 
@@ -56,9 +60,11 @@ def examine(request: SettingsRequest) -> Structure:
     )
     model = space.as_model()
     try:
-        return Structure(model, identifiability(model, seed=chosen.seed), chosen.tied)
+        result = identifiability(model, seed=chosen.seed)
+
     except ModelError as error:
         raise ConfigError(str(error)) from None
+    return Structure(title_of(problem.model_name, problem.model), model, result, chosen.tied)
 
 
 def _group(group: TiedGroup) -> dict[str, Any]:

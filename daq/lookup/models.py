@@ -88,6 +88,17 @@ def without_folders(names: Iterable[str]) -> dict[str, str]:
     return short if len(set(short.values())) == len(short) else {name: name for name in short}
 
 
+def title_of(name: str, model: ProcessModel) -> str:
+    """What to call a model that was named so: the name with its options, a file's by its model.
+
+    >>> title_of("actuator:limits=true", find_model("actuator:limits=true"))
+    'actuator:limits=true'
+    """
+    source, attribute, options = name_parts(name)
+    head = source if attribute is None else model.name
+    return f"{head}:{options}" if options else head
+
+
 def _folder(name: str) -> str:
     source, attribute, _ = name_parts(name)
     return "" if attribute is None else source.removesuffix(Path(source).name)
@@ -105,7 +116,7 @@ def trust_option(name: str) -> str:
 def describe(model: ProcessModel) -> dict[str, Any]:
     """All that a model declares, as JSON can hold it."""
     return {
-        **_attributes(model, "name", "description", "equations"),
+        **_attributes(model, "name", "description", "equations", "assumptions"),
         "states": [
             {**_attributes(s, "name", "unit", "initial"), "estimated": s.initial_range}
             for s in model.states

@@ -9,7 +9,8 @@ import numpy as np
 
 from daq.documents import plain
 from daq.figures.parameters import ratios
-from daq.figures.signals import Panel, responses
+from daq.figures.responses import responses
+from daq.figures.signals import Panel, closer_sentence
 from daq.files import write_whole
 from daq.identification.comparison import ComparisonResult
 from daq.lookup.models import trust_option
@@ -88,6 +89,7 @@ def _first_log(document: Mapping[str, Any], result: ComparisonResult) -> Picture
         "validation",
         "comparison",
         f"Validation ({log.name}): measured outputs, {' and '.join(names)} simulated freely from "
-        "the inputs alone, and below each the residual, measured minus simulated.",
+        "the inputs alone, and below each the residual, measured minus simulated."
+        f"{closer_sentence(panels)}",
         responses(log.time, panels),
     )

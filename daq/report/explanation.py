@@ -7,7 +7,7 @@ from typing import Any
 
 from daq.identification.request import from_here, set_options
 from daq.identification.rows import OutputErrors, Rows, logs_of, mean_errors, start_sentences
-from daq.lookup.models import trust_option
+from daq.lookup.models import title_of, trust_option
 from sysid import ProcessModel
 
 _ENDED = {
@@ -40,6 +40,7 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
         "title": logs[0].name if len(logs) == 1 else f"{len(logs)} logs, the first {logs[0].name}",
         "recorded": _recorded(document["reproduction"]["runs"]),
         "model": model,
+        "model_title": title_of(document["model"], model),
         "quantities": quantities,
         "determined": _determined(document, rows),
         "data_sentence": _data_sentence(document["reproduction"]["logs"]),

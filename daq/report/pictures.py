@@ -18,7 +18,15 @@ from daq.figures import style
 from daq.figures.bode import ComplexArray, bode
 from daq.figures.findings import plot
 from daq.figures.parameters import convergence, correlation, intervals, ranges
-from daq.figures.signals import Panel, overlaid, residual_correlations, responses, signals, spectra
+from daq.figures.responses import responses
+from daq.figures.signals import (
+    Panel,
+    closer_sentence,
+    overlaid,
+    residual_correlations,
+    signals,
+    spectra,
+)
 from daq.files import write_whole
 from daq.findings import Axis
 from daq.identification.records import LoggedRecord
@@ -43,6 +51,7 @@ if TYPE_CHECKING:
 
 _MOTIONS = {"N": ("m", "m/s"), "N*m": ("rad", "rad/s")}  # that a force or torque is drawn over
 _OUTPUTS_A_FIGURE = 4
+_START = "(0)"  # behind the state, in the name of what a record starts from
 _DRAWS = 24  # of the parameters, for bands
 _CLOSER = 60  # samples of a prepared log that are shown closer, as delays are of a few
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
@@ -129,13 +138,14 @@ def _responses(
         which = f"{log.name}, {word}" if word else log.name
         for first in range(0, len(outputs), _OUTPUTS_A_FIGURE):
             shown = range(first, min(first + _OUTPUTS_A_FIGURE, len(outputs)))
+            panels = [_response(outputs[j], log, simulated, j) for j in shown]
             more = f"from-{outputs[first].name}" if first else ""
             yield Picture(
                 _stem(part, word, more), "responses",
                 f"{data} in the fit ({which}). Measured outputs, the identified model{against} "
                 "simulated freely from the inputs alone, and below each the residual"
-                f"{', measured minus simulated' if validation else ''}.",
-                responses(log.time, [_response(outputs[j], log, simulated, j) for j in shown]),
+                f"{', measured minus simulated' if validation else ''}.{closer_sentence(panels)}",
+                responses(log.time, panels),
             )  # fmt: skip
 
 
@@ -191,10 +201,14 @@ def _before_and_after(subject: Subject, log: LoggedRecord, part: tuple[float, fl
 
 def _excitation(subject: Subject) -> Iterator[Picture]:
     log = subject.training[0][0]
+    time, panels = (
+        _foreign_signals(subject.model, log.dataset) if subject.foreign else _capture_signals(log)
+    )
     yield Picture(
         "signals", "excitation",
-        f"What was commanded and measured in the training log {log.dataset.name}.",
-        _foreign_signals(subject.model, log.dataset) if subject.foreign else _capture_signals(log),
+        f"What was commanded and measured in the training log {log.dataset.name}."
+        f"{closer_sentence(panels)}",
+        signals(time, panels),
     )  # fmt: skip
 
 
@@ -263,12 +277,16 @@ def _parameters(rows: Rows) -> Iterator[Picture]:
         for row in (*rows.determined, *rows.combinations)
         if row.interval is not None and row.two_sided
     }
-    if quantities:
+    starts = [name for name in quantities if _START in name]
+    drawn = {name: ends for name, ends in quantities.items() if name not in starts}
+    if drawn:
+        left_out = f"{len(starts)} start{'s' * (len(starts) > 1)} of states in the logs"
         yield Picture(
             "intervals", "parameters",
             "95 % intervals of all that the data determine on both sides: parameters by "
-            "themselves, and combinations of those that act only together.",
-            intervals(list(quantities), np.array(list(quantities.values()))),
+            "themselves, and combinations of those that act only together."
+            f"{f' Of {left_out} the table has the intervals.' if starts else ''}",
+            intervals(list(drawn), np.array(list(drawn.values()))),
         )  # fmt: skip
     names = [row.name for row in rows.determined]
     if len(names) > 1:
@@ -517,19 +535,19 @@ def _stem(*words: str) -> str:
     return "-".join(re.sub(r"[^\w.]+", "-", word) for word in words if word)
 
 
-def _foreign_signals(model: ProcessModel, data: Dataset) -> Figure:
-    """The model's inputs and outputs in a foreign log."""
+def _foreign_signals(model: ProcessModel, data: Dataset) -> tuple[FloatArray, list[Panel]]:
+    """Time and panels of the model's inputs and outputs in a foreign log."""
     panels = [
         Panel(signal.name, signal.unit, {"": values}, steps=signal.hold == "zoh")
         for signal, values in zip(model.inputs, data.inputs.T, strict=True)
     ]
     measured = zip(model.outputs, data.outputs.T, strict=True)
     panels += [Panel(signal.name, signal.unit, {"": values}) for signal, values in measured]
-    return signals(data.time, panels)
+    return data.time, panels
 
 
-def _capture_signals(log: LoggedRecord) -> Figure:
-    """All columns of a capture: commands as asked and as applied, then the sensors."""
+def _capture_signals(log: LoggedRecord) -> tuple[FloatArray, list[Panel]]:
+    """Time and panels of a capture: commands as asked and as applied, then the sensors."""
     columns = _columns(log)
     panels: list[Panel] = []
     for name, unit in UNITS.items():
@@ -539,7 +557,7 @@ def _capture_signals(log: LoggedRecord) -> Figure:
             panels.append(Panel(channel, unit, lines, steps=True))
         elif name != "t" and not name.startswith("applied_"):
             panels.append(Panel(name, unit, {"": columns[name]}))
-    return signals(columns["t"], panels)
+    return columns["t"], panels
 
 
 def _columns(log: LoggedRecord) -> dict[str, FloatArray]:

@@ -92,11 +92,18 @@ def limited_winding(
     return winding(current, saturate(voltage, SUPPLY), back_emf, resistance, inductance)
 
 
-def driver_equations(kind: DriverKind, order: int, index: str) -> tuple[str, ...]:
-    """Equations of an amplifier without limits as text; index: m (motor) or b (brake)."""
-    drive = (
-        f"K_d{index}*(K_v2i*u_{index} - i_{index})" if kind == "closed" else f"G_d{index}*u_{index}"
-    )
+def driver_equations(kind: DriverKind, order: int, index: str, limits: bool) -> tuple[str, ...]:
+    """Equations of an amplifier as text, sat as in ``limit_equations``.
+
+    index: m (motor) or b (brake); limits: whether its range has ends.
+    """
+    i, u = f"i_{index}", f"u_{index}"
+    if kind == "closed":
+        current = f"sat(K_v2i*{u}, {MAX_CURRENT:g})" if limits else f"K_v2i*{u}"
+        drive = f"K_d{index}*({current} - {i})"
+    else:
+        back = f" - {FOLDBACK:g}*({i} - sat({i}, {MAX_CURRENT:g}))" if limits else ""
+        drive = f"G_d{index}*{u}{back}"
     numbers = _numbers(order)
     slower = [
         f"dv_{index}{k}/dt = omega_d{index}{k}*v_{index}{following}"
@@ -107,14 +114,37 @@ def driver_equations(kind: DriverKind, order: int, index: str) -> tuple[str, ...
     return (*slower, f"dv_{last}/dt = omega_d{last}*({drive} - {voltages})")
 
 
-def winding_equations(motor_output: bool, brake_output: bool) -> tuple[str, str]:
-    """Equations of motor and brake as text; whether their amplifiers have an output resistance."""
+def winding_equations(motor_output: bool, brake_output: bool, limits: bool) -> tuple[str, str]:
+    """Equations of motor and brake as text, sat as in ``limit_equations``.
+
+    Whether their amplifiers have an output resistance, and whether their range has ends.
+    """
+    v_m, v_b = (f"sat({v}, {SUPPLY:g})" if limits else v for v in ("v_m", "v_b"))
     R_m = "(R_m + R_om)" if motor_output else "R_m"
     R_b = "(R_b + R_ob)" if brake_output else "R_b"
     return (
-        f"L_m di_m/dt = v_m - {R_m}*i_m + n_c*K_m*omega",
-        f"L_b di_b/dt = v_b - {R_b}*i_b",
+        f"L_m di_m/dt = {v_m} - {R_m}*i_m + n_c*K_m*omega",
+        f"L_b di_b/dt = {v_b} - {R_b}*i_b",
     )
+
+
+def limit_equations(limits: bool) -> tuple[str, ...]:
+    """What ``sat`` means in the equations, where amplifiers have ends of their range."""
+    return ("sat(x, a): x kept within -a .. a",) if limits else ()
+
+
+def limit_assumptions(limits: bool, kind: DriverKind, output: bool) -> tuple[str, ...]:
+    """What rests on the ends of the amplifiers' range, in a sentence.
+
+    kind, output: of the brake's amplifier, and whether it has an output resistance.
+    """
+    gain, resistance = "K_db" if kind == "closed" else "G_db", "R_b + R_ob" if output else "R_b"
+    text = (
+        f"The ends of the amplifiers' range, {SUPPLY:g} V and {MAX_CURRENT:g} A, are assumed and "
+        f"not estimated: what is told apart by them alone, such as {gain}, {resistance} and L_b, "
+        "holds for these ends, and is off as much as they are."
+    )
+    return (text,) if limits else ()
 
 
 def voltages(channel: Channel, order: int) -> tuple[State, ...]:

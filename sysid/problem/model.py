@@ -198,9 +198,10 @@ class ProcessModel:
     label; without it the mean inputs decide.
     ``regressors(record)`` computes signals that linear baselines may have as inputs, see
     ``sysid.problem.regressors``.
-    ``equations`` say to people what the functions compute, one text each. ``variants()`` gives
-    models of the same states and inputs that have what this one may lack, by the option that makes
-    them, such as ``friction=stribeck``.
+    ``equations`` say to people what the functions compute, one text each, and ``assumptions``
+    which constants in them values of parameters rest on. ``variants()`` gives models of the same
+    states and inputs that have what this one may lack, by the option that makes them, such as
+    ``friction=stribeck``.
 
     Raises ModelError when names repeat, an output has no state, or a function returns the
     wrong number of values at the nominal parameters.
@@ -233,6 +234,7 @@ class ProcessModel:
     operating_points: Callable[[Any, Any], Mapping[str, Mapping[str, float]]] | None = None
     regressors: Callable[[Any], Mapping[str, Any]] | None = None
     equations: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
     variants: Callable[[], Mapping[str, ProcessModel]] | None = None
 
     def __repr__(self) -> str:
@@ -241,7 +243,8 @@ class ProcessModel:
         return f"<ProcessModel: {self.name}, {signals}, {sizes}>"
 
     def __post_init__(self) -> None:
-        for kind in ("states", "inputs", "outputs", "parameters", "constraints", "equations"):
+        several = ("constraints", "equations", "assumptions")
+        for kind in ("states", "inputs", "outputs", "parameters", *several):
             items = getattr(self, kind)
             try:
                 object.__setattr__(self, kind, tuple(items))

@@ -1,7 +1,9 @@
 """``rig characterise``: rounds in one folder, which go on from wherever they were ended."""
 
 import contextlib
+import html
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -52,6 +54,18 @@ def test_it_uses_the_time_and_tells_the_parameters(finished):
     for quantity in document["quantities"]:
         assert f'data-value="{quantity["value"]!r}"' in page
     assert (folder / "c" / "report" / "report.html").exists()
+
+
+def test_the_model_and_what_its_values_rest_on_are_named(folder):
+    shown = rig(*words("--time", "0.5", "--model", "actuator:limits=true"), cwd=folder, timeout=300)
+    assert shown.returncode == 0, shown.stderr
+    (sentence,) = actuator(limits=True).assumptions
+    page, report = (
+        html.unescape(re.sub(r"\s+", " ", (folder / "c" / name).read_text().replace("<wbr>", "")))
+        for name in ("characterise.html", "report/report.html")
+    )
+    for text in (" ".join(shown.stdout.split()), page, report):
+        assert "actuator:limits=true" in text and sentence in text
 
 
 def test_the_intervals_hold_what_the_simulated_rig_is_made_of(finished):

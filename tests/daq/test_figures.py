@@ -1,6 +1,7 @@
 """Figures: every axis says what it shows and in which unit, nothing is cut, files are of a kind."""
 
 import datetime
+import itertools
 import re
 import xml.etree.ElementTree as ET
 
@@ -13,7 +14,8 @@ from daq.figures.bode import bode
 from daq.figures.findings import draw, plot
 from daq.figures.history import Overlay, Trend, history
 from daq.figures.parameters import convergence, correlation, intervals, ranges, ratios
-from daq.figures.signals import Panel, responses, signals, spectra
+from daq.figures.responses import responses
+from daq.figures.signals import Panel, closer_sentence, signals, spectra
 from daq.findings import Axis, Chart, Heatmap, Series
 
 TIME = np.linspace(0.0, 1.0, 400)
@@ -38,6 +40,23 @@ def charts():
     return chart, plane, crowd
 
 
+DENSE_TIME = np.arange(3200) / 800.0
+
+
+def dense(amplitude=1.0):
+    """A fast output and one that is noise, over 4 s."""
+    rng = np.random.default_rng(0)
+    fast, still = amplitude * np.sin(200.0 * DENSE_TIME), rng.normal(size=3200)
+    measured = fast + 0.01 * rng.normal(size=3200)
+    note = "fit: identified 99.1 %, linear OE −12.3 %"
+    return [
+        Panel("current", "A", {"measured": measured, "identified": fast, "linear OE": 2.0 * fast},
+              note=note),
+        Panel("speed", "rad/s", {"measured": still, "identified": 0.0 * still, "linear OE": still},
+              note=note),
+    ]  # fmt: skip
+
+
 def drawn():
     lost = np.where(TIME > 0.9, np.nan, WAVE)
     loop = {"angle": TIME, "speed": WAVE, "torque": np.cos(20.0 * TIME)}
@@ -55,6 +74,8 @@ def drawn():
                   note="fit 9 %"),
             Panel(NASTY, "1", {"measured": WAVE, "identified": WAVE}),
         ]),
+        "dense": responses(DENSE_TIME, dense()),
+        "dense signals": signals(DENSE_TIME, dense()),
         "convergence": convergence(np.array([0.5, 0.2, 0.11]), 300, 0.2),
         "ranges": ranges(["K_m", NASTY], places, ["", "only together"]),
         "intervals": intervals(["A alpha0", "k"], ends),
@@ -87,8 +108,8 @@ def figures():
 
 
 NAMES = [
-    "signals", "responses", "convergence", "ranges", "intervals", "correlation", "spectra",
-    "bode", "loops", "points", "chart", "plane", "crowd", "ratios",
+    "signals", "responses", "dense", "dense signals", "convergence", "ranges", "intervals",
+    "correlation", "spectra", "bode", "loops", "points", "chart", "plane", "crowd", "ratios",
 ]  # fmt: skip
 
 
@@ -97,7 +118,8 @@ def test_every_axis_has_a_name_and_a_unit(figures, name):
     for axes in figures[name].axes:
         ticks = [text.get_text() for text in axes.get_yticklabels()]
         words = any(re.search("[A-Za-z]{2}|\\$", text) for text in ticks)  # rows with names
-        if not words and name != "ratios":  # whose rows are named inside
+        shares = axes.yaxis.get_tick_params().get("labelleft", True) is False
+        if not words and not shares and name != "ratios":  # whose rows are named inside
             assert re.search(r"\[.+\]", axes.get_ylabel()), axes.get_ylabel()
         below = axes.xaxis.get_tick_params().get("labelbottom", True)
         shown = any(text.get_text() for text in axes.get_xticklabels())
@@ -199,6 +221,38 @@ def test_a_small_residual_and_a_small_signal_are_in_multiples_of_their_units():
     assert not any(panel.yaxis.get_offset_text().get_text() for panel in figure.axes)
     residual = figure.axes[1].lines[0].get_ydata()
     assert np.nanmax(np.abs(residual)) == pytest.approx(2.0 * np.abs(WAVE).max(), rel=0.1)
+
+
+def test_what_is_too_dense_to_be_read_is_shown_closer_where_it_moves_most():
+    amplitude = np.where((DENSE_TIME > 2.0) & (DENSE_TIME < 2.5), 1.0, 0.3)
+    axes = responses(DENSE_TIME, dense(amplitude)).axes
+    whole, closer = axes[:4], axes[4:]
+    for there, here in zip(whole, closer, strict=True):
+        low, high = here.get_xlim()
+        assert 2.0 < low < high < 2.5 and here.get_ylim() == there.get_ylim()
+        assert there.get_xlim()[0] < 0.0 < 4.0 < there.get_xlim()[1]
+    shown = closer[0].lines[0].get_xdata()
+    swings = 200.0 / np.pi * np.ptp(shown)
+    assert 10 < swings < 30 and np.diff(shown) == pytest.approx(1.25e-3)
+
+
+def test_what_can_be_read_and_what_is_noise_have_no_closer_look():
+    slow = Panel("omega", "rad/s", {"measured": WAVE, "identified": WAVE})
+    assert len(responses(TIME, [slow]).axes) == 2
+    assert len(responses(DENSE_TIME, dense()[1:]).axes) == 2
+    assert closer_sentence([slow]) == "" and "closer" in closer_sentence(dense())
+
+
+@pytest.mark.parametrize("n", [4, 12, 19, 40])
+def test_names_of_correlated_parameters_do_not_overlap(n):
+    names = [f"omega_d{k}" for k in range(n)]
+    figure = correlation(names, np.eye(n))
+    figure.draw_without_rendering()
+    panel = figure.axes[0]
+    for labels in (panel.get_xticklabels(), panel.get_yticklabels()):
+        boxes = [label.get_window_extent() for label in labels]
+        assert len(boxes) == n
+        assert not any(a.overlaps(b) for a, b in itertools.pairwise(boxes))
 
 
 def test_phases_go_on_beyond_a_turn_and_what_may_be_noise_is_left_out():

@@ -54,6 +54,15 @@ def test_people_read_what_acts_together_and_what_to_do(folder):
     assert "measure K by other means and give it under 'fixed'." in result.stdout
 
 
+@pytest.mark.parametrize("arguments", [[], ["--identifiable"]])
+def test_values_that_rest_on_assumed_ends_are_told_with_them(tmp_path, arguments):
+    result = rig("models", "actuator:limits=true", *arguments, cwd=tmp_path)
+    assert result.stdout.startswith("actuator:limits=true: ")
+    assert "24 V and 2.5 A, are assumed" in " ".join(result.stdout.split())
+    assert ("sat(v_b, 24)" in result.stdout) == (not arguments)
+    assert "assumed" not in rig("models", "actuator", *arguments, cwd=tmp_path).stdout
+
+
 def test_machines_read_the_same(folder):
     result = rig("models", "--identifiable", "--config", "id.yaml", "--json", cwd=folder)
     document = json.loads(result.stdout)

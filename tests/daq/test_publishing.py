@@ -293,7 +293,7 @@ def test_a_doubtful_validation_may_feel_what_the_training_hardly_does(document):
     name = next(n for n, p in changed["parameters"].items() if p.get("interval"))
 
     def asked():
-        plain = SimpleNamespace(parameters=(), state_names=())
+        plain = SimpleNamespace(name="plain", parameters=(), state_names=())
         steps = explanation.view(plain, changed, Rows.of(changed))["steps"]
         return [list(s.names) for s in steps if s.before.startswith("Fit the logs of the valid")]
 
@@ -307,7 +307,7 @@ def test_a_doubtful_validation_may_feel_what_the_training_hardly_does(document):
 
 def test_parameters_that_are_bounded_are_no_part_of_the_rest(document):
     changed = copy.deepcopy(document)
-    plain = SimpleNamespace(parameters=(), state_names=())
+    plain = SimpleNamespace(name="plain", parameters=(), state_names=())
 
     def sentence():
         return explanation.view(plain, changed, Rows.of(changed))["determined"]

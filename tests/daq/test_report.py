@@ -1,5 +1,6 @@
 """What ``rig identify`` tells of how far its numbers can be trusted, and where it knows it from."""
 
+import html
 import json
 import math
 import re
@@ -12,11 +13,12 @@ from scipy.signal import lfilter
 
 from daq.errors import ConfigError
 from daq.identification import records as datasets
+from daq.identification.rows import Rows
 from daq.logs.capture import RUN_NAME
-from daq.report.pictures import _loops
+from daq.report.pictures import _loops, _parameters
 from sim_rig.actuator import actuator
 from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
-from tests.daq.support import forked_rig, only_capture, write_experiment
+from tests.daq.support import few_free, forked_rig, only_capture, write_experiment
 
 # A gain of which only a product acts, another that wants to be lower than its range allows, and a
 # parameter that nothing depends on.
@@ -325,6 +327,40 @@ def test_a_calibration_that_makes_no_sense_is_refused(captured, record, case):
         loaded(captured)
     said = str(error.value)
     assert str(path) in said and "'calibration'" in said and "delete it to go without" in said
+
+
+def test_the_ends_of_amplifiers_are_named_with_what_rests_on_them(command, captured):
+    root = captured.parent
+    (root / "few.yaml").write_text(yaml.safe_dump(few_free("R_b", limits=True)))
+    words = ("--model", "actuator:limits=true", "--config", "few.yaml", "--out", "limited")
+    result = command(("identify", captured, *words), root, report=True)
+    assert result.returncode == 0, result.stderr
+    assert "Parameters of actuator:limits=true\n" in result.stdout
+    page = (root / "limited" / "report.html").read_text()
+    said = " ".join(html.unescape(re.sub("<[^>]*>", "", page)).split())
+    assert "Identification of the model “actuator:limits=true”" in said
+    assert "dib/dt=sat(vb,24)−Rbib" in re.sub(r"\s", "", said)
+    (sentence,) = actuator(limits=True).assumptions
+    assert sentence in said and sentence in " ".join(result.stdout.split())
+    assert (root / "limited" / "figures" / "hysteresis.svg").exists()
+    replayed = command(("replay", captured, "--parameters", "limited"), root)
+    assert "through actuator:limits=true with the parameters of limited" in replayed.stdout
+
+
+def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captured):
+    root = captured.parent
+    (root / "tied.yaml").write_text(yaml.safe_dump(few_free("R_m", "alpha0", "alpha1", "A")))
+    words = ("--model", "actuator", "--config", "tied.yaml", "--out", "tied")
+    result = command(("identify", captured, *words), root, report=True)
+    assert result.returncode == 0, result.stderr
+    page = (root / "tied" / "report.html").read_text()
+    assert re.search(r'data-quantity="[^"]*z\(0\)', page)
+    assert "Of 1 start of states in the logs the table has the intervals." in page
+    rows = Rows.of(json.loads((root / "tied" / "report.json").read_text()))
+    figure = next(p.figure for p in _parameters(rows) if p.name == "intervals")
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert any("alpha" in label for label in labels)
+    assert not any("(0)" in label for label in labels)
 
 
 def test_the_command_line_refuses_it_too(command, captured, record):

@@ -72,6 +72,18 @@ def test_functions_of_single_numbers_have_the_same_loops():
         )
 
 
+def test_amplifiers_at_their_ends_change_nothing_of_what_the_brake_resists():
+    plain, limited = actuator(), actuator(limits=True)
+    draws = drawn(plain, 3)
+    for ours, theirs in zip(
+        loops(limited, np.array(limited.nominal), draws, SPEED).curves,
+        loops(plain, np.array(plain.nominal), draws, SPEED).curves,
+        strict=True,
+    ):
+        np.testing.assert_allclose(ours.values["torque"], theirs.values["torque"], atol=1e-6)
+        np.testing.assert_allclose(ours.band, theirs.band, atol=1e-6)
+
+
 @pytest.mark.parametrize(("speed_of_braking", "share"), [(SPEED, 0.0), (0.0, 1.0)])
 def test_a_loop_is_beyond_the_logs_where_they_never_braked_at_that_speed(speed_of_braking, share):
     model = actuator()

@@ -10,6 +10,7 @@ import pytest
 from sim_rig.actuator import actuator
 
 FUNCTIONS = {"abs": abs, "tanh": math.tanh, "exp": math.exp, "cos": math.cos, "sin": math.sin}
+FUNCTIONS["sat"] = lambda value, limit: min(max(value, -limit), limit)
 SYMBOLS = {"voltage_motor": "v_m", "voltage_brake": "v_b", "current_motor": "i_m"}
 SYMBOLS |= {"current_brake": "i_b"}
 SIZES = {"voltage": 5.0, "current_motor": 1.0, "current_brake": 0.1, "omega": 3.0, "z": 0.5}
@@ -61,6 +62,8 @@ CASES = [
     {"driver_brake": "open", "load": "free"},
     {"order_motor": 2, "output_resistance_brake": True},
     {"driver_motor": "open", "order_motor": 3, "order_brake": 2, "output_resistance_motor": True},
+    {"limits": True},
+    {"limits": True, "driver_motor": "open", "driver_brake": "open", "order_brake": 2},
 ]
 
 
@@ -70,12 +73,20 @@ def test_the_text_says_what_is_computed(options):
     if "F_cos" in model.parameter_names:
         model = model.with_parameters(F_cos={"nominal": 0.01}, F_sin={"nominal": -0.004})
     rng = np.random.default_rng(1)
-    for _ in range(5):
+    for scale in (1.0, 1.0, 1.0, 20.0, 20.0):  # also beyond the ends of amplifiers
         sizes = [SIZES.get(name, SIZES.get(name[:7], 2.0)) for name in model.state_names]
-        x = rng.normal(size=len(sizes)) * sizes
-        u = rng.normal(size=len(model.inputs))
+        x = scale * rng.normal(size=len(sizes)) * sizes
+        u = scale * rng.normal(size=len(model.inputs))
         computed = model.derivative(tuple(x.tolist()), tuple(u.tolist()), tuple(model.nominal))
         assert derivative(model, x.tolist(), u.tolist()) == pytest.approx(computed, rel=1e-9)
+
+
+def test_ends_of_amplifiers_are_told_with_what_rests_on_them():
+    plain, limited = actuator(), actuator(limits=True, driver_brake="open")
+    assert plain.assumptions == () and not any("sat" in line for line in plain.equations)
+    (sentence,) = limited.assumptions
+    assert all(part in sentence for part in ("24 V", "2.5 A", "G_db", "R_b", "L_b"))
+    assert "24 V and 2.5 A" in limited.description
 
 
 def test_loads_of_their_own_are_named():
