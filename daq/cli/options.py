@@ -54,9 +54,16 @@ Precision = Annotated[
     str | None,
     Option(metavar="PERCENT", help="Half width wanted of all intervals, such as 5%."),
 ]
-_time = functools.partial(Option, metavar="SECONDS", help="Logged time of all runs, at most.")
-LoggedTime = Annotated[str, _time()]
-LoggedTimeOfDesign = Annotated[str | None, _time()]  # default what the question says
+_time = functools.partial(Option, metavar="SECONDS")
+LoggedTime = Annotated[
+    str | None,
+    _time(
+        help="Logged time of all runs, at most; default 60 s. By the clock computing adds minutes."
+    ),
+]
+LoggedTimeOfDesign = Annotated[  # default what the question says
+    str | None, _time(help="Logged time of all runs, at most.")
+]
 ConfigFile = Annotated[
     Path | None, Option(metavar="ID.yaml", help="Search settings and column names.")
 ]
