@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -142,9 +141,9 @@ def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:
 
 
 def _show_next(result: DesignResult | DiscriminationResult) -> None:
-    print(f"Experiments, {result.figure.name} and design.json: {result.figure.parent}")
-    first = shlex.quote(str(result.runs[0].file)) + options.on_rig(result.rig_name)
-    terminal.print_next(f"rig check {first}", f"rig run {first}, and so each of them")
+    files = f"Experiments, {result.figure.name}, design.json and commands.txt"
+    print(f"{files}: {result.figure.parent}")
+    terminal.print_next(*result.commands)
 
 
 def _span(low: float, high: float) -> str:

@@ -1,7 +1,7 @@
 """What a design holds for people and machines: runs, predicted intervals, what stays unknown."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,8 @@ class PlannedRun:
 class RunsResult(Shown):
     """Runs chosen for a rig, and their files.
 
-    rig_name: as it is typed. noise: standard deviations that the choice counts on.
+    rig_name: as it is typed. noise: standard deviations that the choice counts on. commands: what
+    to type with the files, in order.
     """
 
     question: Question
@@ -72,6 +73,7 @@ class RunsResult(Shown):
     noise: Mapping[str, float]
     folder: Path
     figure: Path
+    commands: tuple[str, ...] = field(default=(), kw_only=True)
 
     @property
     def count(self) -> str:
@@ -88,6 +90,7 @@ class RunsResult(Shown):
             "simulated": chosen.attempts,
             "beyond_limits": chosen.refused,
             "figure": str(self.figure),
+            **({"commands": list(self.commands)} if self.commands else {}),
         }
 
 

@@ -228,7 +228,7 @@ CASES = [
     Case("a list for an experiment", ["run", "e.yaml"],
          ["e.yaml:1:1: expected 'key: value' lines, found a list"], {"e.yaml": "- a\n- b\n"}),
     Case("a folder for an experiment", ["run", "folder"],
-         ["folder: this is a folder; name a YAML file"]),
+         ["folder: no design was written there; name an experiment's file, or a folder that rig"]),
     Case("binary for an experiment", ["run", "e.yaml"],
          ["e.yaml:1: not text in UTF-8; save the file with this encoding"],
          {"e.yaml": b"\xff\xfe\x00p"}),
