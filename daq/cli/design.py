@@ -78,7 +78,7 @@ def _show(result: DesignResult) -> None:
             *notation.measured(quantity.value, quantity.unit, quantity.after),
             *(number(100.0 * width, 2) for width in (quantity.before, quantity.after)),
             number(100.0 * quantity.widest, 2),
-            "-" if quantity.target is None else number(100.0 * quantity.target, 2),
+            "-" if quantity.target is None else notation.shortest(100.0 * quantity.target),
         ]
         for quantity in design.quantities
     ]
@@ -88,6 +88,12 @@ def _show(result: DesignResult) -> None:
         "all that is known, results and ranges together"
     )
     terminal.print_table(title, head, rows, text=["unit"])
+    if result.short:
+        narrowed = ", ".join(f"{q.name} to {number(100.0 * q.after, 2)} %" for q in result.short)
+        terminal.print_text(
+            f"Narrowed, but less than wanted: {narrowed}. What would help: more time, or wider "
+            "limits."
+        )
     for unknown in result.unknown:
         names = ", ".join(unknown.names)
         terminal.print_text(

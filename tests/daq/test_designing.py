@@ -296,6 +296,28 @@ def test_a_later_design_is_identified_with_the_logs_before_it(asked, tmp_path):
 
 
 @pytest.mark.soak
+def test_what_is_printed_as_equal_is_met_and_what_is_narrowed_is_not_unknown(asked, tmp_path):
+    first = rig("design", asked, "--json", "--out", "d", cwd=tmp_path)
+    exact = {q["name"]: 100.0 * q["after"] for q in json.loads(first.stdout)["quantities"]}
+    # Wanted: of K_m so little more than will be had that both print alike, of R_m far more.
+    equal, finer = float(f"{exact['K_m']:.2g}"), 0.2 * exact["R_m"]
+    for k_m in (equal, equal / 1.001):
+        targets = ["--set", f"targets.K_m={k_m}", "--set", f"targets.R_m={finer}"]
+        once = ["--set", "time=1.25 s", *targets]
+        done = rig("design", asked, *once, "--out", "e", cwd=tmp_path)
+        document = json.loads((tmp_path / "e" / "design.json").read_text())
+        quantities = {q["name"]: q for q in document["quantities"]}
+        for name, wanted in (("K_m", k_m), ("R_m", finer)):
+            after = float(f"{100.0 * quantities[name]['after']:.2g}")
+            assert quantities[name]["met"] == (after <= wanted)
+        short = [q["name"] for q in document["quantities"] if q["name"] in document["short"]]
+        assert short == [name for name in ("R_m", "K_m") if not quantities[name]["met"]]
+        assert not {"R_m", "K_m"} & {n for u in document["unknown"] for n in u["names"]}
+        line = next(line for line in done.stdout.splitlines() if line.startswith("Narrowed, but"))
+        assert all(name in line for name in short)
+
+
+@pytest.mark.soak
 def test_designed_files_are_right_from_any_folder(asked, tmp_path):
     write_yaml(tmp_path / "rig.yaml", {"backend": "simulated"})
     for place in ("d", "project/d"):
