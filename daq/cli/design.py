@@ -153,4 +153,6 @@ def _show_next(result: DesignResult | DiscriminationResult) -> None:
 
 
 def _span(low: float, high: float) -> str:
-    return f"{terminal.number(low, 3)} to {terminal.number(high, 3)}"
+    size = max(abs(low), abs(high))
+    ends = (notation.rounded_off(volts, size) for volts in (low, high))
+    return " to ".join(terminal.number(volts, 3) for volts in ends)
