@@ -461,6 +461,14 @@ CASES = [
           "0.001 s, of which it holds 3, too few", "write the unit that they are in: s, ms, us"],
          {"id.yaml": COLUMNS.replace("{column: t}", "{unit: s, column: t, grid: 1 ms}"),
           "log.csv": ROWS + "0,0,0\n2,0,0\n4,0,1\n"}),
+    Case("a result for a configuration", ["identify", "log.csv", "--config", "id.yaml"],
+         ["id.yaml:2:1: this is a result of an identification, and should be its settings; give "
+          "--config the file of settings, and a result with --given to keep what it holds, or "
+          "with --parameters where a command has that"],
+         {"id.yaml": "model: actuator\nverdict: {trust: good}\nparameters: {}\nmetrics: {}\n"}),
+    Case("a result for a rig", ["run", "prbs.yaml", "--rig", "rig.yaml"],
+         ["rig.yaml:2:1: this is a result of an identification, and should be a rig;"],
+         {"rig.yaml": "model: actuator\nverdict: {trust: good}\nmetrics: {}\n"}),
     Case("missing configuration", ["identify", "log.csv", "--config", "absent.yaml"],
          ["absent.yaml: there is no such file; check its name"]),
     Case("an unknown preset", ["identify", "log.csv", "--preset", "thesys"],
