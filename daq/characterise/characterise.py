@@ -197,11 +197,11 @@ def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> C
         _identify([*done, current], request, watch)
         done.append(current)
         reason = _end(request, done)
-        write_page(root, done, reason)
+        write_page(root, done, reason, request.precision)
     last, report = done[-1], root / "report" / "report.html"
     if "missing" not in last.result or not report.exists():
         _identify(done, request, watch, ends=True)
-    page = write_page(root, done, reason)
+    page = write_page(root, done, reason, request.precision)
     return Characterisation(
         root, tuple(done), tuple(last.intervals()), _spent(done), reason,
         last.result["verdict"], page, report, request.precision,

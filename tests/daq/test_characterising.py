@@ -16,6 +16,7 @@ from tests.daq.support import few_free, rig, start_rig, write_yaml
 
 pytestmark = pytest.mark.soak
 
+FREE = {"R_m", "K_m", "B_m"}
 QUICK = ["candidates=8", "generations=0", "draws=1", "checks=2", "calibration=16", "run=0.5 s"]
 
 
@@ -98,6 +99,8 @@ def test_more_time_given_with_resume_is_recorded_and_used(finished, tmp_path):
     marks = {words[0]: words[-1] for line in done.stdout.splitlines() if (words := line.split())}
     assert (marks["K_m"], marks["B_m"]) == ("met", "missed")
     assert "Wider than the 0.9 % wanted: " in done.stdout
+    page = (tmp_path / "c" / "characterise.html").read_text()
+    assert page.count("<td>met</td>") + page.count("<td>missed</td>") == len(marks.keys() & FREE)
     assert "rig characterise --resume c --time 5" in done.stdout
 
 
