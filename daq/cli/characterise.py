@@ -56,7 +56,7 @@ def characterise(
 
     Until the intervals are narrow enough, the time is used up, or no run would tell more. One
     folder holds designs, logs, results and a page; however it ended it goes on from there. By the
-    clock 10 s of the shipped rig take 5 to 10 minutes on two cores, nearly all of it computing.
+    clock 10 s of the shipped rig take some 6 minutes on two cores, nearly all of it computing.
     """
     from daq.characterise import characterise as use_case
     from daq.lookup.rigs import DEFAULT_RIG
