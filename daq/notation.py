@@ -14,6 +14,7 @@ _GREEK = {
     "eta": "η", "theta": "θ", "kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ",
     "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ", "chi": "χ", "psi": "ψ", "omega": "ω",
 }  # fmt: skip
+_ROUNDING = 1e-12  # of the numbers that sums are made of
 JOINTS = "-_,:/"  # behind which a long name may be broken
 _SYMBOL = re.compile(rf"({'|'.join(_GREEK)}|[A-Za-z])(\d*)(?:_([A-Za-z0-9]+))?(\(0\))?")
 _ATOM = re.compile(r"([^\W\d]\w*(?:\(0\))?)")
@@ -112,6 +113,15 @@ def number(value: float, digits: int = 4) -> str:
     if int(power) > exponent:  # 9.96e-5 is 1.00e-4, as 0.0996 is 0.100: its last place stays
         mantissa += "0" if digits > 1 else ".0"
     return f"{mantissa}e{int(power)}"
+
+
+def rounded_off(value: float, size: float) -> float:
+    """A number, or 0 where it is what rounding leaves beside numbers of a size.
+
+    >>> rounded_off(0.14 - 0.07 - 0.07 + 2.8e-17, 0.14), rounded_off(1e-6, 0.14)
+    (0.0, 1e-06)
+    """
+    return 0.0 if abs(value) <= _ROUNDING * abs(size) else value
 
 
 def digits(value: float, deviation: float | None) -> int:

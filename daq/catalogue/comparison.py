@@ -54,6 +54,7 @@ def _overlays(root: Path, entries: Sequence[RunEntry], watch: Watch) -> list[Ove
     from daq.logs.columns import UNITS
     from daq.logs.recording import load
 
+    entries = [entry for entry in entries if entry.is_run]
     if len(entries) > _MOST_LINES:
         watch(
             Note("note", f"signals of the last {_MOST_LINES} of {len(entries)} runs are drawn only")
@@ -85,7 +86,7 @@ def _trends(entries: Sequence[RunEntry], names: Sequence[str]) -> list[Trend]:
         rows = [
             (entry, row)
             for entry in entries
-            if entry.started and (row := entry.quantity(name)) is not None
+            if entry.started and entry.is_run and (row := entry.quantity(name)) is not None
         ]
         dates = [datetime.datetime.fromisoformat(entry.started) for entry, _ in rows]
         values = np.array([(row.value, *_ends(row)) for _, row in rows], dtype=np.float64)

@@ -22,6 +22,7 @@ from daq.identification.rows import ParameterRow, QuantityRow, Rows
 from daq.logs.capture import LOG_NAME, RUN_NAME, settings_of
 from daq.logs.metadata import METADATA_NAME, read_metadata
 
+JOINT, ALONE = "joint", "identified"  # status of results by themselves: of several logs, of one
 _IDENTIFICATION = "identification"  # the folder of a run's own identification
 _FILES = (RUN_NAME, METADATA_NAME, f"{_IDENTIFICATION}/{PARAMETERS}")
 
@@ -31,9 +32,10 @@ class RunEntry:
     """A run: where it is, what it was, what is noted of it, what was identified from it.
 
     folder: below the catalogue's, with ``/`` between names. started: ISO 8601 in UTC. trust: the
-    verdict's word, then of predictions and of parameters. rows: the fields of ``quantities`` as
-    JSON, read when they are asked for: ten thousand runs have a quarter of a million of them.
-    problems: what of its files could not be read, and why.
+    verdict's word, then of predictions and of parameters. logs: names of those that a result by
+    itself was identified from; empty of a run. rows: the fields of ``quantities`` as JSON, read
+    when they are asked for: ten thousand runs have a quarter of a million of them. problems: what
+    of its files could not be read, and why.
     """
 
     folder: str
@@ -48,6 +50,7 @@ class RunEntry:
     predictions: str = ""
     parameters: str = ""
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    logs: tuple[str, ...] = ()
     rows: str = "[]"
     problems: tuple[str, ...] = ()
 
@@ -55,6 +58,11 @@ class RunEntry:
     def values(self) -> dict[str, float]:
         """Identified parameters and combinations by name."""
         return {name: value for name, value, *_ in from_json(self.rows)}
+
+    @property
+    def is_run(self) -> bool:
+        """Whether it was recorded, and is no result by itself."""
+        return self.status not in (JOINT, ALONE)
 
     @property
     def described(self) -> dict[str, Any]:
@@ -90,7 +98,7 @@ class RunEntry:
 
 
 def captures(root: Path) -> Iterator[tuple[str, str]]:
-    """Capture folders below a folder, and what tells that their files have changed.
+    """Folders of captures and of results below a folder, and what tells that they have changed.
 
     Each by its name below the folder, in order. What is in a capture is not looked through.
     """
@@ -107,6 +115,8 @@ def _captures(root: str, below: str) -> Iterator[tuple[str, str]]:
         if stamp:
             yield folder, stamp
         else:
+            if result := _time_and_size(f"{root}/{folder}/{PARAMETERS}"):
+                yield folder, f"{result}|{_time_and_size(f'{root}/{folder}/{METADATA_NAME}')}"
             yield from _captures(root, folder)
 
 
@@ -127,10 +137,11 @@ def _time_and_size(path: str) -> str:
 
 
 def read_entry(root: Path, folder: str) -> RunEntry:
-    """A run from its files; what cannot be read is told in ``problems``."""
+    """A run or a result from its files; what cannot be read is told in ``problems``."""
     path, problems = root / folder, []
     facts: dict[str, Any] = {}
-    for read in (_run, _noted, _identified):
+    is_run = any((path / name).exists() for name in (RUN_NAME, LOG_NAME))
+    for read in (_run, _noted, _identified) if is_run else (_result, _noted):
         try:
             facts |= read(path)
         except RigError as error:
@@ -164,9 +175,25 @@ def _noted(folder: Path) -> dict[str, Any]:
 
 def _identified(folder: Path) -> dict[str, Any]:
     path = folder / _IDENTIFICATION / PARAMETERS
-    if not path.exists():
-        return {}
+    return _facts(yaml_file.load(path).content) if path.exists() else {}
+
+
+def _result(folder: Path) -> dict[str, Any]:
+    """Of a result that lies by itself, as that of several runs does."""
+    path = folder / PARAMETERS
     document = yaml_file.load(path).content
+    logs = tuple(str(log["name"]) for log in document["metrics"]["training"])
+    written = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC)
+    status = JOINT if len(logs) > 1 else ALONE
+    return {
+        "started": written.isoformat(timespec="seconds"),
+        "status": status,
+        "logs": logs,
+        **_facts(document),
+    }
+
+
+def _facts(document: Mapping[str, Any]) -> dict[str, Any]:
     verdict, rows = document["verdict"], Rows.of(document)
     statements = {
         name: verdict[name]["trust"] for name in ("predictions", "parameters") if name in verdict
@@ -207,4 +234,4 @@ def to_text(entry: RunEntry) -> str:
 def from_text(text: str) -> RunEntry:
     """An entry from its line. Raises ValueError, TypeError or KeyError for what is none."""
     document = from_json(text)
-    return RunEntry(**{**document, "problems": tuple(document["problems"])})
+    return RunEntry(**{**document, **{k: tuple(document[k]) for k in ("logs", "problems")}})

@@ -14,7 +14,7 @@ from daq.progress import Note, Progress, Watch, ignore
 
 INDEX_NAME = ".runs.sqlite"  # in the folder of the runs
 _TABLE = "CREATE TABLE IF NOT EXISTS runs (folder TEXT PRIMARY KEY, stamp TEXT, entry TEXT)"
-_LAYOUT = 3  # of an entry; an index of another is made anew
+_LAYOUT = 4  # of an entry; an index of another is made anew
 _SHOWN = 50  # runs to read from which on it is worth showing progress
 _WAIT = 2.0  # s for another program that writes the index
 

@@ -41,6 +41,7 @@ _LATER = 0.5  # of what is left, for each that follows
 _LEAST = 2  # runs of a last round: fewer join the round before
 _SEEDS = 2**32  # that a simulated rig takes
 _WORTH = 0.9  # of the widths, to which another mounting must be expected to bring them
+_NO_RUN = "no run within the limits would tell more"
 _GAIN = 0.98  # of the widths, to which a round must be expected to bring them
 
 
@@ -49,6 +50,7 @@ class Characterisation(Shown):
     """A rig's parameters after all rounds, and why there are no more.
 
     intervals: after the last round. seconds: logged in all. verdict: of the last identification.
+    precision: half width that was wanted [%], None for as narrow as the time allows.
     """
 
     folder: Path
@@ -59,6 +61,19 @@ class Characterisation(Shown):
     verdict: dict[str, Any]
     page: Path
     report: Path
+    precision: float | None = None
+
+    @property
+    def missed(self) -> list[str]:
+        """Quantities whose intervals are wider than wanted, or have no two ends."""
+        if self.precision is None:
+            return []
+        return [i.name for i in self.intervals if not i.is_within(self.precision)]
+
+    @property
+    def helped_by_time(self) -> bool:
+        """Whether more time would let it go on."""
+        return self.reason != _NO_RUN
 
     @property
     def headline(self) -> str:
@@ -91,6 +106,8 @@ class Characterisation(Shown):
             "logged_seconds": self.seconds,
             "ended": self.reason,
             "quantities": [asdict(interval) for interval in self.intervals],
+            "wanted_percent": self.precision,
+            "missed": self.missed,
             "verdict": self.verdict,
             "parameters": str(self.rounds[-1].identification / "parameters.yaml"),
             "page": str(self.page),
@@ -141,15 +158,26 @@ def characterise(
 
 
 def resume(
-    folder: str | Path, *, ask: Ask | None = None, watch: Watch = ignore
+    folder: str | Path,
+    time: float | None = None,
+    precision: float | None = None,
+    *,
+    ask: Ask | None = None,
+    watch: Watch = ignore,
 ) -> Characterisation:
     """Go on with a characterisation from what is there, however it ended.
 
-    ask: as of ``characterise``; None: the mounting stays as it is. Raises ConfigError where none
-    has begun, or where not even a first round would tell anything, and what a run raises.
+    time, precision: in place of what was wanted until then, and from then on; None: as it was. ask:
+    as of ``characterise``; None: the mounting stays as it is. Raises ConfigError where none has
+    begun, or where not even a first round would tell anything, and what a run raises.
     """
     root = Path(folder)
-    request = replace(Request.load(root), ask=ask is not None)
+    recorded = Request.load(root)
+    request = recorded.changed(time, precision)
+    if request != recorded:
+        request.rewrite(root)
+        Round(root, len(rounds_of(root)) + 1).discard_design()
+    request = replace(request, ask=ask is not None)
     try:
         return _continued(root, request, ask, watch)
     except (KeyboardInterrupt, Terminated, RigError) as stop:
@@ -169,21 +197,21 @@ def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> C
         if not _design(current, request, done, watch):
             if not done:
                 raise _nothing_to_tell(current)
-            reason = "no run within the limits would tell more"
+            reason = _NO_RUN
             break
         _change_mounting(current, request, done, ask)
         _run(current, done, watch)
         _identify([*done, current], request, watch)
         done.append(current)
         reason = _end(request, done)
-        write_page(root, done, reason)
+        write_page(root, done, reason, request.precision)
     last, report = done[-1], root / "report" / "report.html"
     if "missing" not in last.result or not report.exists():
         _identify(done, request, watch, ends=True)
-    page = write_page(root, done, reason)
+    page = write_page(root, done, reason, request.precision)
     return Characterisation(
         root, tuple(done), tuple(last.intervals()), _spent(done), reason,
-        last.result["verdict"], page, report,
+        last.result["verdict"], page, report, request.precision,
     )  # fmt: skip
 
 
@@ -220,8 +248,8 @@ def _end(request: Request, done: Sequence[Round], result: Mapping[str, Any] | No
     if not done:
         return ""
     if request.precision is not None:
-        widths = [interval.width for interval in done[-1].intervals(result)]
-        if all(w is not None and 100.0 * w <= request.precision for w in widths):
+        intervals = done[-1].intervals(result)
+        if all(interval.is_within(request.precision) for interval in intervals):
             return f"all that experiments tell is known to {request.precision:g} %"
     spent = _spent(done)
     if spent + done[-1].seconds / len(done[-1].experiments) > request.time * (1.0 + 1e-9):

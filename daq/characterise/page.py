@@ -19,10 +19,13 @@ from daq.report.publication import FIGURES, draw
 _PAGE, _DATA = "characterise.html", "rounds.json"
 
 
-def write_page(root: Path, rounds: Sequence[Round], reason: str) -> Path:
+def write_page(
+    root: Path, rounds: Sequence[Round], reason: str, precision: float | None = None
+) -> Path:
     """Write the page, its figure and its numbers; the page's path.
 
-    reason: why there are no more rounds; empty where there are. Raises RunError where the disk
+    reason: why there are no more rounds; empty where there are. precision: half width that is
+    wanted [%], None for as narrow as they get. Raises RunError where the disk
     refuses.
     """
     histories = [each.intervals() for each in rounds]
@@ -33,6 +36,12 @@ def write_page(root: Path, rounds: Sequence[Round], reason: str) -> Path:
             "assumptions": rounds[-1].result.get("assumptions", []),
             "ended": reason,
             "logged_seconds": float(seconds[-1]),
+            "wanted_percent": precision,
+            "missed": [
+                interval.name
+                for interval in histories[-1]
+                if precision is not None and not interval.is_within(precision)
+            ],
             "verdict": rounds[-1].result["verdict"],
             "rounds": [
                 {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from daq.identification.request import PARAMETERS
 from daq.logs.capture import COMPLETED, INTERLOCK, RUN_NAME
 from daq.lookup.models import without_folders
 from sysid import EarlierMinima
+from sysid.experiments import is_as_narrow
 
 _REQUEST = "characterise.json"
 _RUNS, _IDENTIFICATION = "runs", "identification"
@@ -55,7 +56,19 @@ class Request:
                 f"go on with it: rig characterise --resume {folder}, or choose another with --out"
             )
             raise ConfigError("a characterisation has begun there", cure=cure, file=folder)
-        write_whole(file, json.dumps(asdict(self), indent=1) + "\n")
+        self.rewrite(folder)
+
+    def rewrite(self, folder: Path) -> None:
+        """Write it over the one that is there."""
+        write_whole(folder / _REQUEST, json.dumps(asdict(self), indent=1) + "\n")
+
+    def changed(self, time: float | None, precision: float | None) -> Request:
+        """The same with another time or precision, None for the one that it has."""
+        return replace(
+            self,
+            time=self.time if time is None else time,
+            precision=self.precision if precision is None else precision,
+        )
 
     @classmethod
     def load(cls, folder: Path) -> Request:
@@ -90,6 +103,10 @@ class Interval:
     low: float | None = None
     high: float | None = None
 
+    def is_within(self, percent: float) -> bool:
+        """Whether its interval is as narrow as that, as printed."""
+        return self.width is not None and is_as_narrow(self.width, percent / 100.0)
+
 
 @dataclass(frozen=True)
 class Round:
@@ -117,6 +134,13 @@ class Round:
     def is_designed(self) -> bool:
         """Whether its design is there."""
         return (self.folder / DATA).exists()
+
+    def discard_design(self) -> None:
+        """Delete a design of which nothing has been run."""
+        if self.is_designed and not self.runs.exists():
+            for experiment in self.experiments:
+                experiment.unlink(missing_ok=True)
+            (self.folder / DATA).unlink()
 
     @property
     def is_identified(self) -> bool:

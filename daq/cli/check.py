@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
 from daq.cli import options, terminal
+from daq.errors import ConfigError, together
 
 if TYPE_CHECKING:
     from daq.experiment import Evidence
@@ -21,7 +23,7 @@ _WIDTH, _HEIGHT = 58, 48.0  # characters and dB of a spectrum's sketch
 
 
 def check(
-    experiment: options.ExperimentName,
+    experiments: options.ExperimentNames,
     rig: options.RigOfRun = None,
     port: options.PortName = None,
     plot: Annotated[
@@ -38,22 +40,33 @@ def check(
     ] = 1000,
     json: options.AsJson = False,
 ) -> None:
-    """Say what an experiment will do, and energise nothing.
+    """Say what experiments will do, and energise nothing.
 
-    It is checked against the rig's limits as before a run: duration, peaks, spectrum; and with a
+    Each is checked against the rig's limits as before a run: duration, peaks, spectrum; and with a
     torque controller by trials.
     """
     from daq.recording import preview
     from daq.recording.session import lacks_port
 
     with terminal.watching(json) as watch:
-        checked = preview.check(experiment, rig, port, draws=draws, watch=watch)
+        files = options.experiment_files(experiments)
+        if plot is not None and len(files) > 1:
+            problem = "it draws one experiment"
+            raise ConfigError(problem, cure="name one of them", key="--plot")
+        every = together(
+            *(partial(preview.check, file, rig, port, draws=draws, watch=watch) for file in files)
+        )
+    checked = every[0]
     if plot is not None:
         preview.draw_preview(checked, plot)
+    if json and len(every) > 1:
+        terminal.print_json({"experiments": [each.document for each in every]})
+        return
     if json:
         terminal.print_json({**checked.document, "plot": plot})
         return
-    _show(checked)
+    for each in every:
+        _show(each, alone=len(every) == 1)
     if plot is not None:
         print(f"Figure: {plot}")
     if lacks_port(checked.session.rig):
@@ -61,12 +74,14 @@ def check(
         terminal.print_text(
             "No port is named in the rig's file, nor by --port: rig ports lists them."
         )
-    identify = " --identify" if checked.session.validation and not checked.concludes else ""
+    validates = len(every) == 1 and checked.session.validation and not checked.concludes
+    identify = " --identify" if validates else ""
     on_rig = options.rig_words(rig, port)
-    terminal.print_next(f"rig run {shlex.quote(experiment)}{on_rig}{identify}")
+    behind = [] if on_rig or len(every) == 1 else options.next_of_design(files, None)
+    terminal.print_next(*(behind or [f"rig run {shlex.join(experiments)}{on_rig}{identify}"]))
 
 
-def _show(checked: Preview) -> None:
+def _show(checked: Preview, *, alone: bool) -> None:
     plan, experiment, session = checked.plan, checked.experiment, checked.session
     at_most = "up to " if plan.commands is None else ""
     _show_channels(
@@ -94,6 +109,8 @@ def _show(checked: Preview) -> None:
         print("Its commands are zero throughout: it excites nothing, and logs everything.")
     elif checked.concludes:
         print("It concludes by itself: results stand in the run's folder.")
+    elif not alone:
+        print()
     elif session.validation:
         print("With --identify a validation run follows.")
     else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -79,7 +78,7 @@ def _show(result: DesignResult) -> None:
             *notation.measured(quantity.value, quantity.unit, quantity.after),
             *(number(100.0 * width, 2) for width in (quantity.before, quantity.after)),
             number(100.0 * quantity.widest, 2),
-            "-" if quantity.target is None else number(100.0 * quantity.target, 2),
+            "-" if quantity.target is None else notation.shortest(100.0 * quantity.target),
         ]
         for quantity in design.quantities
     ]
@@ -89,6 +88,12 @@ def _show(result: DesignResult) -> None:
         "all that is known, results and ranges together"
     )
     terminal.print_table(title, head, rows, text=["unit"])
+    if result.short:
+        narrowed = ", ".join(f"{q.name} to {number(100.0 * q.after, 2)} %" for q in result.short)
+        terminal.print_text(
+            f"Narrowed, but less than wanted: {narrowed}. What would help: more time, or wider "
+            "limits."
+        )
     for unknown in result.unknown:
         names = ", ".join(unknown.names)
         terminal.print_text(
@@ -142,10 +147,12 @@ def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:
 
 
 def _show_next(result: DesignResult | DiscriminationResult) -> None:
-    print(f"Experiments, {result.figure.name} and design.json: {result.figure.parent}")
-    first = shlex.quote(str(result.runs[0].file)) + options.on_rig(result.rig_name)
-    terminal.print_next(f"rig check {first}", f"rig run {first}, and so each of them")
+    files = f"Experiments, {result.figure.name}, design.json and commands.txt"
+    print(f"{files}: {result.figure.parent}")
+    terminal.print_next(*result.commands)
 
 
 def _span(low: float, high: float) -> str:
-    return f"{terminal.number(low, 3)} to {terminal.number(high, 3)}"
+    size = max(abs(low), abs(high))
+    ends = (notation.rounded_off(volts, size) for volts in (low, high))
+    return " to ".join(terminal.number(volts, 3) for volts in ends)

@@ -2,6 +2,7 @@
 
 import functools
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,11 +11,12 @@ from typer import Argument, Option
 from daq.cli import completion
 
 LOGS = Argument(metavar="RUN_OR_CSV...", help="Capture folders, CSV logs, or folders of them.")
-ExperimentName = Annotated[
-    str,
+ExperimentNames = Annotated[
+    list[str],
     Argument(
-        metavar="EXPERIMENT.yaml",
-        help="Experiment file; a bare name not in this folder means the shipped one.",
+        metavar="EXPERIMENT.yaml...",
+        help="Experiment files, or a folder that rig design wrote for all of its; a bare name not "
+        "in this folder means the shipped one.",
         autocompletion=completion.experiments,
     ),
 ]
@@ -54,9 +56,16 @@ Precision = Annotated[
     str | None,
     Option(metavar="PERCENT", help="Half width wanted of all intervals, such as 5%."),
 ]
-_time = functools.partial(Option, metavar="SECONDS", help="Logged time of all runs, at most.")
-LoggedTime = Annotated[str, _time()]
-LoggedTimeOfDesign = Annotated[str | None, _time()]  # default what the question says
+_time = functools.partial(Option, metavar="SECONDS")
+LoggedTime = Annotated[
+    str | None,
+    _time(
+        help="Logged time of all runs, at most; default 60 s. By the clock computing adds minutes."
+    ),
+]
+LoggedTimeOfDesign = Annotated[  # default what the question says
+    str | None, _time(help="Logged time of all runs, at most.")
+]
 ConfigFile = Annotated[
     Path | None, Option(metavar="ID.yaml", help="Search settings and column names.")
 ]
@@ -96,6 +105,27 @@ WithReport = Annotated[
     bool, Option("--report/--no-report", help="Write report.html with its figures as well.")
 ]
 AsJson = Annotated[bool, Option("--json", help="One JSON document on standard output.")]
+
+
+def experiment_files(names: Sequence[str]) -> list[str]:
+    """Experiments by the names that were typed, folders as what is in them.
+
+    Raises ConfigError for a folder without a design.
+    """
+    if not any(Path(name).is_dir() for name in names):
+        return list(names)
+    from daq.designs.commands import experiments_of
+
+    return [file for name in names for file in experiments_of(name)]
+
+
+def next_of_design(files: Sequence[str], out: Path | None) -> list[str]:
+    """What serves after runs of a design into a folder, or before them; empty for others."""
+    if not all((Path(file).parent / "design.json").exists() for file in files):
+        return []
+    from daq.designs.commands import commands_behind
+
+    return commands_behind(list(map(Path, files)), out)
 
 
 def rig_words(rig: str | None, port: str | None) -> str:

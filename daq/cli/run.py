@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,15 +12,17 @@ from typer import Option
 
 from daq.cli import options, terminal
 from daq.cli.interrupt import heeded
+from daq.errors import ConfigError, RigError, Terminated, together
 
 if TYPE_CHECKING:
     from daq.identification.settings import Problem
     from daq.lookup.experiments import LoadedExperiment
-    from daq.recording.session import SessionResult
+    from daq.progress import Watch
+    from daq.recording.session import Session, SessionResult
 
 
 def run(
-    experiment: options.ExperimentName,
+    experiments: options.ExperimentNames,
     rig: options.RigOfRun = None,
     port: options.PortName = None,
     out: options.RunsFolder = Path("runs"),
@@ -33,22 +38,46 @@ def run(
     report: options.WithReport = True,
     json: options.AsJson = False,
 ) -> None:
-    """Run an experiment on a rig and log every sample."""
+    """Run experiments on a rig and log every sample.
+
+    Of several all are checked before the first is run; what stops a run stops those behind it.
+    """
     from daq.cli.analyse import next_commands
-    from daq.recording.session import open_session
 
     with terminal.watching(json) as watch:
-        session = open_session(experiment, rig, port, realtime, watch=watch).noting(note or [])
+        files = options.experiment_files(experiments)
+        if identify and len(files) > 1:
+            cure = "run them without it, and then rig identify with all runs"
+            several = "it identifies from one experiment and its validation run"
+            raise ConfigError(several, cure=cure, key="--identify")
+        sessions = together(
+            *(partial(_session, f, rig, port, realtime, note, watch) for f in files)
+        )
+        session = sessions[0]
         # A mistake in the model must show before the rig moves.
         problem = _problem(config, model, session.loaded, watch) if identify else None
-        result = session.record(out, validation=identify, watch=watch)
+        if len(files) > 1:
+            again = options.rig_words(rig, port) + f" --out {shlex.quote(str(out))}"
+            results = _record_each(sessions, files, out, again, watch)
+        else:
+            results = [session.record(out, validation=identify, watch=watch)]
+    behind = options.next_of_design(files, out)
+    if len(results) > 1:
+        _finish(results, behind, json)
+        return
+    result = results[0]
     document = _document(result)
     if not json:
         _show(result)
         if not session.plan.excites:
             _show_rest(result.run.folder, options.rig_words(rig, port))
         elif not identify:
-            terminal.print_next(*next_commands(result.run.folder))
+            commands = Path(files[0]).with_name("commands.txt")
+            if not behind and commands.exists():
+                terminal.print_text(
+                    f"It is a run of a design, whose runs are identified together: {commands}"
+                )
+            terminal.print_next(*(behind or next_commands(result.run.folder)))
     if problem is not None:
         if result.validation is None and not json:
             path = session.loaded.file.path
@@ -60,8 +89,48 @@ def run(
         terminal.print_json(document)
 
 
+def _session(
+    experiment: str,
+    rig: str | None,
+    port: str | None,
+    realtime: bool,
+    notes: list[str] | None,
+    watch: Watch,
+) -> Session:
+    from daq.recording.session import open_session
+
+    return open_session(experiment, rig, port, realtime, watch=watch).noting(notes or [])
+
+
+def _record_each(
+    sessions: Sequence[Session], files: Sequence[str], out: Path, words: str, watch: Watch
+) -> list[SessionResult]:
+    """Run one after the other; what stops a run is told with the command for the rest."""
+    results: list[SessionResult] = []
+    try:
+        for session in sessions:
+            results.append(session.record(out, validation=False, watch=watch))
+    except (KeyboardInterrupt, Terminated, RigError) as stop:
+        n = len(results)
+        rest = f"rig run {shlex.join(files[n:])}{words}"
+        stop.add_note(f"{n} of {len(files)} runs were completed; go on with: {rest}")
+        raise
+    return results
+
+
+def _finish(results: Sequence[SessionResult], behind: Sequence[str], json: bool) -> None:
+    """Show several runs, and what serves after them."""
+    if json:
+        terminal.print_json({"runs": [_document(result) for result in results]})
+        return
+    for result in results:
+        _show(result)
+    folders = [str(result.run.folder) for result in results]
+    terminal.print_next(*(behind or [f"rig identify {shlex.join(folders)}"]))
+
+
 def _problem(
-    config: Path | None, model: str | None, loaded: LoadedExperiment, watch: Any
+    config: Path | None, model: str | None, loaded: LoadedExperiment, watch: Watch
 ) -> Problem:
     from daq.config import yaml_file
     from daq.identification.request import SettingsRequest
@@ -75,7 +144,6 @@ def _problem(
 
 def _intended_model(loaded: LoadedExperiment) -> str | None:
     """Whole name of the model that the experiment is for; ConfigError names file and line."""
-    from daq.errors import ConfigError
     from daq.lookup.models import find_model, whole_name
 
     name, file = loaded.experiment.model, loaded.file

@@ -58,7 +58,10 @@ def runs(
     ] = None,
     json: options.AsJson = False,
 ) -> None:
-    """List recorded runs; search, compare and annotate them."""
+    """List recorded runs; search, compare and annotate them.
+
+    Results of several runs are listed as well, as joint, where they lie in the folder of the runs.
+    """
     from daq.catalogue.annotation import annotate
     from daq.catalogue.index import catalogue
     from daq.catalogue.query import ordered, require_quantities, select
@@ -93,7 +96,8 @@ def runs(
         _compare(chosen, names)
     else:
         room = len(chosen) if last or not sys.stdout.isatty() else _MOST_ROWS
-        _list(chosen, names, f"{len(chosen)} of {len(entries)} runs in {folder}", room)
+        what = "runs" if all(entry.is_run for entry in entries) else "runs and results"
+        _list(chosen, names, f"{len(chosen)} of {len(entries)} {what} in {folder}", room)
     for problem in (problem for entry in chosen for problem in entry.problems):
         terminal.report("warning", problem)
     if plot is not None and chosen:
@@ -179,6 +183,7 @@ def _show(entry: RunEntry, folder: Path) -> None:
         "protocol": entry.protocol,
         "rig": entry.rig,
         "device": entry.device,
+        "identified from": ", ".join(entry.logs),
         **{key: _text(value) for key, value in entry.metadata.items()},
         "model": entry.model,
         "predictions": entry.predictions or entry.trust,

@@ -75,19 +75,33 @@ def refuse(mistakes: Sequence[Mistake]) -> None:
 
 
 # Keys by which each kind of file is known when it is given in another's place, and the cure.
+_SETTINGS = "an identification's settings"
 _SEARCH_KEYS = {"model", "columns", "ranges", "fixed", "population", "preset"}
 _QUESTION_KEYS = {"targets", "precision", "criterion", "time", "plant", "protocols", "noise"}
 _KINDS = {
     "an experiment": ({"protocol"}, "name it behind rig run or rig check"),
     "a rig": ({"backend", "limits", "sensors"}, "give it with --rig"),
     "a torque controller's settings": ({"controller"}, "give it to rig tune"),
-    "an identification's settings": (_SEARCH_KEYS, "give it with --config"),
+    _SETTINGS: (_SEARCH_KEYS, "give it with --config"),
     "a design's question": (_QUESTION_KEYS, "name it behind rig design"),
 }
 
 
+_RESULT_KEYS = {"verdict", "metrics"}  # which all results have, and no file that is written by hand
+_OTHER_CURE = "give it with --parameters where a command has that"
+_RESULT_CURE = (
+    "give --config the file of settings, and a result with --given to keep what it holds, or with "
+    "--parameters where a command has that"
+)
+
+
 def refuse_other_kind(file: YamlFile, wanted: str) -> None:
     """Raise ConfigError for a file of another kind than the wanted one, named as in ``_KINDS``."""
+    if file.content.keys() >= _RESULT_KEYS:
+        should = "its settings" if wanted == _SETTINGS else wanted
+        problem = f"this is a result of an identification, and should be {should}"
+        cure = _RESULT_CURE if wanted == _SETTINGS else _OTHER_CURE
+        raise ConfigError.of([replace(file.mistake(("verdict",), problem, cure), key="")])
     if any(key in file.content for key in _KINDS[wanted][0]):
         return
     for kind, (marks, cure) in _KINDS.items():

@@ -11,6 +11,8 @@ from typing import Any
 from daq.config import check, yaml_file
 from daq.config.yaml_file import TypedSettings
 from daq.designs import discrimination
+from daq.designs.commands import FILE as COMMANDS
+from daq.designs.commands import commands_of, text_of
 from daq.designs.discrimination import DiscriminationResult
 from daq.designs.pictures import draw_design
 from daq.designs.result import DesignResult
@@ -71,7 +73,7 @@ def design_files(
         return discrimination.write(setups, discrimination.choose(setups, watch), folder)
     setup = set_up(file, watch)
     check_writable(folder)
-    return write(setup, choose(setup, watch), folder)
+    return write(setup, choose(setup, watch), folder, commands_of(setup, folder))
 
 
 def choose(setup: Setup, watch: Watch = ignore) -> Design:
@@ -127,16 +129,21 @@ def _refusals(setup: Setup) -> str:
     return text
 
 
-def write(setup: Setup, chosen: Design, folder: Path) -> DesignResult:
+def write(
+    setup: Setup, chosen: Design, folder: Path, commands: tuple[str, ...] = ()
+) -> DesignResult:
     """A design's experiments, its figure and its document, in a folder that may be new.
 
-    The document is the last of them. Raises RunError where the disk refuses.
+    commands: what to type with them, written as well. The document is the last of them. Raises
+    RunError where the disk refuses.
     """
     runs = write_runs([setup], chosen.runs, folder)
     result = DesignResult(
         setup.question, setup.rig_name, runs, setup.noise, folder, folder / FIGURE,
-        setup.problem.model, setup.problem.model_name, chosen,
+        setup.problem.model, setup.problem.model_name, chosen, commands=commands,
     )  # fmt: skip
+    if commands:
+        write_whole(folder / COMMANDS, text_of(commands))
     draw_design(result, setup.rig)
     write_whole(folder / DATA, json.dumps(plain(result.document), indent=1) + "\n")
     return result

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from daq.designs.commands import FILE as COMMANDS
+from daq.designs.commands import commands_of, text_of
 from daq.designs.pictures import draw_runs
 from daq.designs.result import RunsResult
 from daq.designs.runs import DATA, FIGURE, progress_of, write_runs
@@ -83,16 +85,19 @@ def choose(setups: Mapping[str, Setup], watch: Watch = ignore) -> Discrimination
 def write(
     setups: Mapping[str, Setup], chosen: Discrimination, folder: Path
 ) -> DiscriminationResult:
-    """Its experiments, figure and document, in a folder that may be new.
+    """Its experiments, figure, commands and document, in a folder that may be new.
 
     The document is the last of them. Raises RunError where the disk refuses.
     """
     first = next(iter(setups.values()))
     runs = write_runs(list(setups.values()), chosen.runs, folder)
     models = {name: each.problem.model_name for name, each in setups.items()}
+    commands = commands_of(first, folder, list(models.values()))
     result = DiscriminationResult(
-        first.question, first.rig_name, runs, first.noise, folder, folder / FIGURE, models, chosen
-    )
+        first.question, first.rig_name, runs, first.noise, folder, folder / FIGURE, models, chosen,
+        commands=commands,
+    )  # fmt: skip
+    write_whole(folder / COMMANDS, text_of(commands))
     draw_runs(runs, first.rig, {}, result.figure)
     write_whole(folder / DATA, json.dumps(plain(result.document), indent=1) + "\n")
     return result

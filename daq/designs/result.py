@@ -1,7 +1,7 @@
 """What a design holds for people and machines: runs, predicted intervals, what stays unknown."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from daq.designs.bench import COMMANDED
 from daq.hal import FloatArray
 from daq.views import Shown
 from sysid import Design, ProcessModel
-from sysid.experiments import ChosenRuns
+from sysid.experiments import ChosenRuns, PredictedQuantity
 
 _WIDE = 0.5  # half width in parts of the value, from which a quantity counts as hardly known
 
@@ -63,7 +63,8 @@ class PlannedRun:
 class RunsResult(Shown):
     """Runs chosen for a rig, and their files.
 
-    rig_name: as it is typed. noise: standard deviations that the choice counts on.
+    rig_name: as it is typed. noise: standard deviations that the choice counts on. commands: what
+    to type with the files, in order.
     """
 
     question: Question
@@ -72,6 +73,7 @@ class RunsResult(Shown):
     noise: Mapping[str, float]
     folder: Path
     figure: Path
+    commands: tuple[str, ...] = field(default=(), kw_only=True)
 
     @property
     def count(self) -> str:
@@ -88,6 +90,7 @@ class RunsResult(Shown):
             "simulated": chosen.attempts,
             "beyond_limits": chosen.refused,
             "figure": str(self.figure),
+            **({"commands": list(self.commands)} if self.commands else {}),
         }
 
 
@@ -137,6 +140,7 @@ class DesignResult(RunsResult):
             "quantities": [
                 {**asdict(quantity), "met": quantity.met} for quantity in self.design.quantities
             ],
+            "short": [quantity.name for quantity in self.short],
             "unknown": [asdict(unknown) for unknown in self.unknown],
             "otherwise": self.otherwise,
             **self.of_runs(self.design),
@@ -156,16 +160,14 @@ class DesignResult(RunsResult):
             unknown.append(Unknown(self.design.unseen, "it acts on nothing measured", cure))
         return unknown
 
+    @property
+    def short(self) -> list[PredictedQuantity]:
+        """Quantities that these runs tell, but less closely than was asked for."""
+        return [q for q in self.design.quantities if not q.met and q.after <= _WIDE]
+
     def _of_information(self) -> list[Unknown]:
-        """What these runs do not tell well enough."""
-        missed = [q for q in self.design.quantities if not q.met]
-        wide = [q for q in self.design.quantities if q.target is None and q.after > _WIDE]
-        unknown = []
-        for quantities, why in (
-            (missed, "the time or the limits do not allow what was asked for"),
-            (wide, "these runs hardly feel it"),
-        ):
-            if quantities:
-                cure = "give more time, or wider limits; or fix it by other means"
-                unknown.append(Unknown(tuple(q.name for q in quantities), why, cure))
-        return unknown
+        """What these runs hardly tell."""
+        quantities = [q for q in self.design.quantities if q.target is None or not q.met]
+        wide = tuple(quantity.name for quantity in quantities if quantity.after > _WIDE)
+        cure = "give more time, or wider limits; or fix it by other means"
+        return [Unknown(wide, "these runs hardly feel it", cure)] if wide else []

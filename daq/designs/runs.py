@@ -11,7 +11,8 @@ from daq.config.question import Question
 from daq.designs.result import PlannedRun
 from daq.designs.setup import Setup
 from daq.files import make_folder, write_whole
-from daq.lookup.schemas import schema_comment
+from daq.lookup.schemas import nearest_folder, schema_comment
+from daq.lookup.shipped import find_file, shipped_files
 from daq.progress import Progress, Watch
 from sysid.experiments import DesignedRun
 
@@ -35,11 +36,11 @@ def write_runs(
         )
         for each in setups
     ]
-    runs = []
+    rig, runs = _from_anywhere(setups[0].rig_name), []
     for k, run in enumerate(chosen, 1):
         path = folder / f"designed-{k}.yaml"
         content = setups[0].families[run.excitation].content(run.settings)
-        write_whole(path, _experiment_text(content, setups[0].rig_name, k, len(chosen)))
+        write_whole(path, _head(folder, k, len(chosen)) + _experiment_text(content, rig))
         each = [
             setup.bench.signals(run.inputs, run.dt, of_it)
             for setup, of_it in zip(setups, vectors, strict=True)
@@ -61,7 +62,17 @@ def progress_of(question: Question, watch: Watch) -> Callable[[int, int], None]:
     return report
 
 
-def _experiment_text(content: Mapping[str, Any], rig: str, number: int, count: int) -> str:
-    head = f"{schema_comment('experiment')}\n# Run {number} of {count} of a design by rig design.\n"
+def _from_anywhere(rig: str) -> str:
+    """A rig's file by a name that holds in any folder: absolute, or that of a shipped one."""
+    path = find_file("backend", rig)
+    return rig if path in shipped_files("backend").values() else str(path.resolve())
+
+
+def _head(folder: Path, number: int, count: int) -> str:
+    schema = schema_comment("experiment", nearest_folder("experiment", folder))
+    return f"{schema}\n# Run {number} of {count} of a design by rig design.\n"
+
+
+def _experiment_text(content: Mapping[str, Any], rig: str) -> str:
     file = {"protocol": content["protocol"], "rig": rig, **content}
-    return head + yaml.safe_dump(file, sort_keys=False, default_flow_style=None)
+    return yaml.safe_dump(file, sort_keys=False, default_flow_style=None)

@@ -37,7 +37,7 @@ _TURNS = 5.0  # of a cable, where a question does not say how many to wind
 class Setup:
     """A question with all that it names, checked before anything is computed."""
 
-    file: YamlFile
+    file: TypedSettings
     question: Question
     rig_name: str
     rig: RigConfig
@@ -85,7 +85,7 @@ def structure_names(file: TypedSettings, question: Question) -> dict[str, str]:
     if isinstance(structures, list):
         names = {name: name for name in structures}
     else:
-        model = _beside(file, "model", question.model) or DEFAULT_MODEL
+        model = beside(file, "model", question.model) or DEFAULT_MODEL
         colon = "," if name_parts(model)[2] else ":"
         names = {"": f"{model}{colon}"}
         for option, choices in structures.items():
@@ -106,11 +106,11 @@ def _set_up_each(
     file: TypedSettings, question: Question, names: Sequence[str | None], watch: Watch
 ) -> list[Setup]:
     """A question's setup for each of several models, None for the one that it names."""
-    rig_name = _beside(file, "rig", question.rig) or DEFAULT_RIG
+    rig_name = beside(file, "rig", question.rig) or DEFAULT_RIG
     rig, device = load_rig(rig_name, watch=watch)
-    config = _beside(file, "config", question.config)
+    config = beside(file, "config", question.config)
     result = _earlier(file, question)
-    model, record = _beside(file, "model", question.model), None
+    model, record = beside(file, "model", question.model), None
     if model is None and result is not None:
         model, record = result.content.get("model"), result.path
     models = [name or model for name in names]
@@ -121,7 +121,7 @@ def _set_up_each(
         turns = _TURNS if rig.limits.winding is not None else 0.0
     frame = _frame(file, question, rig, _shaft(rig, problems[0].model, turns))
     families = families_of(file, question, frame, turns)
-    log = _beside(file, "log", question.log)
+    log = beside(file, "log", question.log)
     recording = None if log is None else load_recording(log_path(Path(log)))
     if recording is not None:
         require_calibrated(Path(str(log)), recording)
@@ -155,11 +155,11 @@ def _is_of(result: YamlFile | None, problem: Problem) -> bool:
 
 def _earlier(file: TypedSettings, question: Question) -> YamlFile | None:
     """The result of an earlier identification that a question names."""
-    path = _beside(file, "parameters", question.parameters)
+    path = beside(file, "parameters", question.parameters)
     return None if path is None else stages.load([Path(path)])[0]
 
 
-def _beside(file: TypedSettings, key: str, name: str | None) -> str | None:
+def beside(file: TypedSettings, key: str, name: str | None) -> str | None:
     """A file that a question names, from its folder; typed and shipped names as they are."""
     if not name or key in file.typed:
         return name or None

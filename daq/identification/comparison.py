@@ -20,8 +20,8 @@ from daq.identification.campaign import (
     parse_seeds,
     run_all,
 )
-from daq.identification.fit import check_writable, default_folder
-from daq.identification.request import SettingsRequest
+from daq.identification.fit import check_writable, default_folder, tell_replaced
+from daq.identification.request import PARAMETERS, SettingsRequest
 from daq.identification.result import Identification
 from daq.identification.settings import problems_of
 from daq.lookup.models import without_folders
@@ -45,6 +45,7 @@ from sysid.judging.comparison import Row
 from sysid.linear import ARMAX, ARX, OE, Orders, tuned
 from sysid.problem.regressors import with_regressors
 
+COMPARISON = "comparison.yaml"
 _FORMULA = (
     "AIC = n_e ln det S + 2 k, BIC = n_e ln det S + k ln n_e; S: mean square of the training "
     "residuals of all outputs, n_e: independent samples they are worth, k: determined parameters"
@@ -131,7 +132,7 @@ class ComparisonResult(Shown):
     @property
     def file(self) -> Path:
         """Where the document was written."""
-        return self.folder / "comparison.yaml"
+        return self.folder / COMPARISON
 
     @cached_property
     def document(self) -> dict[str, Any]:
@@ -186,6 +187,7 @@ def compare(wanted: ComparisonRequest, watch: Watch = ignore) -> ComparisonResul
     if wanted.out is None and not alone:
         folder = folder.with_name("comparison")
     check_writable(folder)
+    tell_replaced(folder / (PARAMETERS if alone else COMPARISON), watch)
     shown = without_folders(problem.model_name for problem in problems)
     groups = [
         groups_of(p, shown[p.model_name], wanted.logs, wanted.validate, together=True)[0]

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from daq.config import yaml_file
 from daq.errors import ConfigError, Terminated
 from daq.identification import records, request
 from daq.identification.foreign import ColumnMapping
 from daq.identification.placement import placement_faults
 from daq.identification.records import LoggedRecord, Split
-from daq.identification.request import SettingsRequest
+from daq.identification.request import PARAMETERS, SettingsRequest
 from daq.identification.result import FittedLog, Identification, filter_noise, least_noise
 from daq.identification.selection import EVERYTHING, Selection
 from daq.identification.settings import Problem, gassi_settings, problem_of
@@ -99,6 +100,7 @@ def identify_files(
     problem = problem_of(settings, watch, logs=[*logs, *validate])
     folder = out or default_folder(logs, problem.model.name)
     check_writable(folder)
+    tell_replaced(folder / PARAMETERS, watch)
     return fit(problem, logs, validate, folder, watch, draft=draft)
 
 
@@ -292,6 +294,23 @@ def check_writable(folder: Path) -> None:
         reason = "permission denied" if there.is_dir() else f"{there} is not a folder"
         cure = "choose a folder with --out"
         raise ConfigError(f"cannot be created: {reason}", cure=cure, file=folder)
+
+
+def tell_replaced(file: Path, watch: Watch) -> None:
+    """Tell of the result or comparison that a file holds, if any, before another replaces it."""
+    if not file.exists():
+        return
+    try:
+        content = yaml_file.load(file).content
+        logs = content.get("training", (content.get("metrics") or {}).get("training")) or ()
+        count = f" of {len(logs)} log{'s' * (len(logs) != 1)}"
+    except (AttributeError, TypeError, ConfigError):
+        content, count = {}, ""
+    kind = "comparison" if "structures" in content else "result"
+    model = f" with {content['model']}" if content.get("model") else ""
+    written = datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC)
+    text = f"this replaces the {kind}{count}{model}, written {written:%Y-%m-%d %H:%M} UTC"
+    watch(Note("note", f"{file}: {text}; --out DIR keeps it"))
 
 
 def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:

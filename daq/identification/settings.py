@@ -298,6 +298,8 @@ def reading_of(
     ``key=value``. Raises ConfigError.
     """
     written = None if config is None else yaml_file.load(config)
+    if written is not None:
+        check.refuse_other_kind(written, "an identification's settings")
     file, unconverted = in_model_units(TypedSettings.of({}, typed, written), [model])
     settings = check.validate(file, IdentificationConfig, others=unconverted)
     selection, columns = Selection.under(settings, file), settings.columns

@@ -18,7 +18,10 @@ DEFAULT_RIG = "simulated.yaml"
 
 
 def rig_for(experiment: str, watch: Watch = ignore) -> str:
-    """The rig file that an experiment's file says it is for; the simulated rig's without."""
+    """The rig file that an experiment's file says it is for; the simulated rig's without.
+
+    Raises ConfigError that names the line where that file is not there.
+    """
     try:
         file = yaml_file.load(find_file("protocol", experiment, watch))
     except ConfigError:
@@ -27,7 +30,13 @@ def rig_for(experiment: str, watch: Watch = ignore) -> str:
     if not isinstance(name, str) or not name:
         return DEFAULT_RIG
     beside = file.path.parent / name
-    return str(beside) if beside.exists() else name
+    if beside.exists():
+        return str(beside)
+    try:
+        find_file("backend", name)
+    except ConfigError as error:
+        raise ConfigError.of(file.blamed(("rig",), error)) from None
+    return name
 
 
 def load_rig(

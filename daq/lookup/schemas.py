@@ -23,6 +23,7 @@ from daq.torque import TorqueControl
 
 Schema = dict[str, Any]
 FOLDER = "schemas"
+_SHIPPED = Path(__file__).resolve().parents[1] / FOLDER
 DRAFT = "http://json-schema.org/draft-07/schema#"
 # What pydantic calls a bound that it could not put where the number is.
 _BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
@@ -32,6 +33,15 @@ _FILE_AND_CLASS = {"type": "string", "pattern": r"\.py:\w+$", "description": "FI
 def schema_comment(kind: str, folder: Path | str = FOLDER) -> str:
     """The line by which an editor finds the schema of a file, relative to the file."""
     return f"# yaml-language-server: $schema={Path(folder).as_posix()}/{kind}.json"
+
+
+def nearest_folder(kind: str, folder: Path) -> Path:
+    """Where the schema of a file in a folder lies: above it, relative to it, or the shipped one."""
+    there = folder.resolve()
+    for up, place in enumerate([there, *there.parents]):
+        if (place / FOLDER / f"{kind}.json").exists():
+            return Path(*[".."] * up, FOLDER)
+    return _SHIPPED
 
 
 def as_yaml(value: Any) -> str:

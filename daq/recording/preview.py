@@ -13,6 +13,7 @@ from daq.experiment import ClosedLoop, Evidence, Experiment, Plan, TripLimits
 from daq.files import write_whole
 from daq.hal import CHANNELS, Disclosing, FloatArray
 from daq.logs.columns import UNITS
+from daq.notation import rounded_off
 from daq.progress import Event, Note, Watch, ignore
 from daq.recording.session import Session, open_session
 from daq.run.protocol import evidence_of, preview_of
@@ -205,12 +206,14 @@ def spectral_lines(column: FloatArray, sample_rate: float) -> tuple[FloatArray, 
 
 def _facts(planned: Plan, rig: RigConfig, settings: Experiment, name: str) -> ChannelFacts:
     index = CHANNELS.index(name)
-    lowest, highest = float(planned.lowest[index]), float(planned.highest[index])
+    ends = float(planned.lowest[index]), float(planned.highest[index])
+    lowest, highest = (rounded_off(volts, max(map(abs, ends))) for volts in ends)
     limits = getattr(rig.limits.command, name)
     if planned.commands is None:
         return ChannelFacts(lowest, highest, limits)
     column = planned.commands[planned.steady, index]
-    mean, changes = float(column.mean()), int(np.count_nonzero(np.diff(column)))
+    mean = rounded_off(float(column.mean()), float(np.max(np.abs(column))))
+    changes = int(np.count_nonzero(np.diff(column)))
     frequency, sizes = spectral_lines(column, settings.sample_rate)
     power = np.cumsum(sizes**2)
     if power[-1] == 0.0:

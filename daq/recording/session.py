@@ -95,10 +95,13 @@ def open_session(
     rig: default what the experiment's file says it is for. port, realtime: settings of its backend
     over those of its file. to_run: whether the rig has to be reachable.
     """
-    name = rig or rig_for(experiment, watch)
-    loaded, (config, device) = together(
-        lambda: load_experiment(experiment, watch),
-        lambda: rig_on(name, port, realtime, watch),
+
+    def load_rig_of_it() -> tuple[str, RigConfig, Device]:
+        name = rig or rig_for(experiment, watch)
+        return name, *rig_on(name, port, realtime, watch)
+
+    loaded, (name, config, device) = together(
+        lambda: load_experiment(experiment, watch), load_rig_of_it
     )
     # Checked even where it will not run: a mistake in the file is best heard of early.
     validation = loaded.validation()

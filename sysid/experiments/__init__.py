@@ -8,6 +8,7 @@ from sysid.experiments.experiment import (
     DesignedRun,
     PredictedQuantity,
     design,
+    is_as_narrow,
 )
 from sysid.experiments.feedback import Feedback
 from sysid.experiments.prior import Prior
@@ -25,4 +26,5 @@ __all__ = [
     "Setting",
     "design",
     "discriminate",
+    "is_as_narrow",
 ]

@@ -51,6 +51,15 @@ class DesignedRun:
         return inputs.n_samples if isinstance(inputs, Feedback) else len(inputs)
 
 
+def is_as_narrow(width: float, wanted: float) -> bool:
+    """Whether a half width is the wanted one at most, in the two digits of it that are printed.
+
+    >>> is_as_narrow(0.1002, 0.1), is_as_narrow(0.107, 0.1)
+    (True, False)
+    """
+    return float(f"{100.0 * width:.2g}") <= 100.0 * wanted * (1.0 + 1e-9)
+
+
 @dataclass(frozen=True)
 class PredictedQuantity:
     """What a design would tell of a parameter or a combination: its 95 % interval.
@@ -70,8 +79,8 @@ class PredictedQuantity:
 
     @property
     def met(self) -> bool:
-        """Whether what was asked for is to be expected."""
-        return self.target is None or self.after <= self.target
+        """Whether what was asked for is to be expected, as printed."""
+        return self.target is None or is_as_narrow(self.after, self.target)
 
 
 @dataclass(frozen=True)

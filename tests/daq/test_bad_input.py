@@ -230,7 +230,7 @@ CASES = [
     Case("a list for an experiment", ["run", "e.yaml"],
          ["e.yaml:1:1: expected 'key: value' lines, found a list"], {"e.yaml": "- a\n- b\n"}),
     Case("a folder for an experiment", ["run", "folder"],
-         ["folder: this is a folder; name a YAML file"]),
+         ["folder: no design was written there; name an experiment's file, or a folder that rig"]),
     Case("binary for an experiment", ["run", "e.yaml"],
          ["e.yaml:1: not text in UTF-8; save the file with this encoding"],
          {"e.yaml": b"\xff\xfe\x00p"}),
@@ -463,6 +463,14 @@ CASES = [
           "0.001 s, of which it holds 3, too few", "write the unit that they are in: s, ms, us"],
          {"id.yaml": COLUMNS.replace("{column: t}", "{unit: s, column: t, grid: 1 ms}"),
           "log.csv": ROWS + "0,0,0\n2,0,0\n4,0,1\n"}),
+    Case("a result for a configuration", ["identify", "log.csv", "--config", "id.yaml"],
+         ["id.yaml:2:1: this is a result of an identification, and should be its settings; give "
+          "--config the file of settings, and a result with --given to keep what it holds, or "
+          "with --parameters where a command has that"],
+         {"id.yaml": "model: actuator\nverdict: {trust: good}\nparameters: {}\nmetrics: {}\n"}),
+    Case("a result for a rig", ["run", "prbs.yaml", "--rig", "rig.yaml"],
+         ["rig.yaml:2:1: this is a result of an identification, and should be a rig;"],
+         {"rig.yaml": "model: actuator\nverdict: {trust: good}\nmetrics: {}\n"}),
     Case("missing configuration", ["identify", "log.csv", "--config", "absent.yaml"],
          ["absent.yaml: there is no such file; check its name"]),
     Case("an unknown preset", ["identify", "log.csv", "--preset", "thesys"],

@@ -313,6 +313,37 @@ def test_a_folder_of_runs_is_identified_together(lab):
     assert [f"runs/{log['name']}" for log in logs] == sorted(captures(lab))
 
 
+def test_a_joint_result_is_listed_with_the_runs_that_it_used_and_compared(lab, tmp_path):
+    shutil.copytree(lab, tmp_path, dirs_exist_ok=True)
+    runs = [run["folder"] for run in listed(tmp_path)]
+    words = ("--model", "coil.py:coil", "--population", 10, "--generations", 5)
+    result = rig("identify", "runs", *words, "--out", "runs/both", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    result = rig("identify", f"runs/{runs[0]}", *words, "--out", "runs/a/again", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    results = {run["folder"]: run for run in listed(tmp_path) if run["folder"] not in runs}
+    assert {name: run["status"] for name, run in results.items()} == {
+        "both": "joint", "a/again": "identified"
+    }  # fmt: skip
+    assert results["both"]["logs"] == runs and results["both"]["trust"]
+    assert len(listed(tmp_path)) == 5
+    assert [run["folder"] for run in listed(tmp_path, "status=joint")] == ["both"]
+    assert [run["folder"] for run in listed(tmp_path, "runs/both")] == ["both"]
+    shown = rig("runs", cwd=tmp_path).stdout
+    assert "5 of 5 runs and results in runs" in shown
+    assert next(line for line in shown.splitlines() if " both " in line).split()[3:5] == [
+        "joint", results["both"]["trust"]
+    ]  # fmt: skip
+    details = rig("runs", "runs/both", "--details", cwd=tmp_path).stdout
+    assert f"identified from: {', '.join(runs)}" in " ".join(details.split())
+    compared = rig("runs", "--compare", "--parameters", "gain", cwd=tmp_path).stdout
+    assert "both" in next(line for line in compared.splitlines() if line.startswith(" parameter"))
+    noted = rig("runs", "runs/both", "--note", "sample=MRB-2", cwd=tmp_path)
+    assert noted.returncode == 0 and len(listed(tmp_path, "sample=MRB-2")) == 1
+    drawn = rig("runs", "--plot", "p.png", cwd=tmp_path)
+    assert drawn.returncode == 0 and "not drawn" not in drawn.stderr
+
+
 @pytest.mark.parametrize("damage", ["deleted", "no database", "a folder", "another layout"])
 def test_the_index_can_be_lost(lab, damage):
     before = listed(lab)

@@ -18,6 +18,7 @@ from tests.daq.support import few_free, rig, start_rig, write_yaml
 
 pytestmark = pytest.mark.soak
 
+FREE = {"R_m", "K_m", "B_m"}
 QUICK = ["candidates=8", "generations=0", "draws=1", "checks=2", "calibration=16", "run=0.5 s"]
 
 
@@ -100,6 +101,40 @@ def test_what_was_done_is_not_done_again(finished, tmp_path):
     assert (tmp_path / "c" / "report" / "report.html").exists()
 
 
+def test_more_time_given_with_resume_is_recorded_and_used(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
+    more = ["--resume", "c", "--time", "2.5", "--precision", "0.9%"]
+    done = rig("characterise", *more, cwd=tmp_path, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "It ended because the 2.5 s are used up" in done.stdout
+    recorded = Request.load(tmp_path / "c")
+    assert (recorded.time, recorded.precision) == (2.5, 0.9)
+    assert len(rounds_of(tmp_path / "c")) > len(rounds_of(finished[0] / "c"))
+    marks = {words[0]: words[-1] for line in done.stdout.splitlines() if (words := line.split())}
+    assert (marks["K_m"], marks["B_m"]) == ("met", "missed")
+    assert "Wider than the 0.9 % wanted: " in done.stdout
+    page = (tmp_path / "c" / "characterise.html").read_text()
+    assert page.count("<td>met</td>") + page.count("<td>missed</td>") == len(marks.keys() & FREE)
+    assert "rig characterise --resume c --time 5" in done.stdout
+
+
+def test_an_option_that_resuming_cannot_change_is_refused(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
+    before = (tmp_path / "c" / "characterise.json").read_text()
+    for more, named in (
+        (["simulated.yaml"], "RIG.yaml"),
+        (["--model", "actuator", "--set", "run=1 s"], "--model, --set"),
+        (["--config", "id.yaml", "--time", "9"], "--config"),
+        (["--out", "d"], "--out"),
+        (["--plant", "actuator"], "--plant"),
+    ):
+        done = rig("characterise", *more, "--resume", "c", cwd=tmp_path)
+        assert done.returncode == 2
+        assert f"c: {named} cannot be changed on resuming" in done.stderr
+        assert "leave out all but --time, --precision and --ask" in done.stderr
+    assert (tmp_path / "c" / "characterise.json").read_text() == before
+
+
 def test_a_later_round_begins_where_the_last_one_left_no_quantity_without_an_end(
     finished, tmp_path
 ):
@@ -154,7 +189,8 @@ def test_mistakes_are_named_before_anything_is_written(folder):
 
 def test_a_first_design_that_promises_nothing_is_refused_in_words(folder):
     deaf = ["--set", "noise={current_motor: 1e4, current_brake: 1e4, omega: 1e7, torque: 1e4}"]
-    for words_of_it in (words("--time", "1", *deaf), ["characterise", "--resume", "c"]):
+    resumed = ["characterise", "--resume", "c"]
+    for words_of_it in (words("--time", "1", *deaf), resumed, [*resumed, "--time", "2"]):
         done = rig(*words_of_it, cwd=folder, timeout=120)
         assert done.returncode == 2
         assert "no run within the limits would tell the parameters better" in done.stderr

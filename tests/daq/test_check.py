@@ -90,6 +90,20 @@ def test_a_multisine_is_stated_without_its_ramps(command, tmp_path):
     assert motor["power_band_hz"][0] >= 1.0 and motor["power_band_hz"][1] <= 99.0
 
 
+def test_what_rounding_leaves_of_zero_is_zero(command, tmp_path):
+    brake = {"amplitude": 0.1, "offset": 0.1, "band": [1, 20], "harmonics": "odd", "seed": 8}
+    motor = {"amplitude": 1.5, "band": [1, 100], "seed": 1}
+    e = {"protocol": "multisine", "sample_rate": 800, "period": 1, "periods": 2, "ramp": 0.1}
+    more = {"draws": 2, "homing": {"turns": 5}, "motor": motor, "brake": brake}
+    (tmp_path / "e.yaml").write_text(yaml.safe_dump({**e, **more}))
+    lowest = load_experiment(str(tmp_path / "e.yaml")).plan(RigConfig()).commands[:, 1].min()
+    assert 0.0 < lowest < 1e-15
+    shown = command(["check", "e.yaml"], tmp_path).stdout
+    assert next(line.split()[-1] for line in shown.splitlines() if line[:7] == " lowest") == "0"
+    stated = json.loads(command(["check", "e.yaml", "--json"], tmp_path).stdout)
+    assert stated["channels"]["brake"]["lowest_volts"] == 0.0
+
+
 def test_machines_hear_of_limits_that_protect_nothing(command, tmp_path):
     for speed, count in ((190.0, 0), (191.0, 1)):
         limits, amplifiers = {"speed": speed}, {"motor": 0.5, "speed": 95.0}

@@ -481,6 +481,26 @@ def test_a_log_without_time_has_its_rate_in_the_configuration(tmp_path):
 
 
 @pytest.mark.soak
+def test_a_result_that_is_replaced_is_told(captured, tmp_path):
+    root, folder = captured
+    words = ["identify", root / folder, "--config", root / "few.yaml", "--out", "free"]
+    first = rig(*words, cwd=tmp_path)
+    assert first.returncode == 0 and "replaces" not in first.stderr, first.stderr
+    again = rig(*words, cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    replaced = "note: free/parameters.yaml: this replaces the result of 1 log with actuator, "
+    assert replaced in again.stderr
+    assert "; --out DIR keeps it" in again.stderr
+    mistaken = rig(*words, "--population", "1", cwd=tmp_path)
+    assert mistaken.returncode == 2 and "replaces" not in mistaken.stderr
+    compared = [*words[:-1], "both", "--arx"]
+    for said in (False, True):
+        done = rig(*compared, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        line = "note: both/comparison.yaml: this replaces the comparison of 1 log, "
+        assert (line in done.stderr) == said
+
+
 def test_one_seed_gives_one_result(captured, tmp_path):
     root, folder = captured
     values = []

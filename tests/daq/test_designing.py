@@ -1,6 +1,8 @@
 """``rig design``: files that ``rig run`` runs, within limits, and what they would tell."""
 
 import json
+import shlex
+import shutil
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from daq.logs.encoder import mean_speeds
 from daq.lookup.classes import find_class
 from daq.lookup.rigs import load_rig
 from sim_rig.actuator import actuator
-from tests.daq.support import few_free, merged, rig, write_yaml
+from tests.daq.support import few_free, merged, rig, write_experiment, write_yaml
 
 QUICK = {"candidates": 10, "generations": 0, "draws": 1, "checks": 2, "calibration": 16}
 QUESTION = {**QUICK, "time": "2.5 s", "config": "id.yaml", "targets": {"K_m": "1 %"}}
@@ -227,6 +229,151 @@ def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path)
     for run in document["runs"]:
         checked = rig("check", run["file"], "--json", cwd=tmp_path)
         assert json.loads(checked.stdout)["samples"] == 1000
+
+
+MOST = ["--set", "targets.K_m=0.001"]  # asks for as many runs as the time holds
+
+
+def printed_commands(text):
+    """What stands behind Next and Then."""
+    return [
+        line.partition(": ")[2] for line in text.splitlines() if line[:6] in ("Next: ", "Then: ")
+    ]
+
+
+@pytest.mark.soak
+def test_the_commands_of_a_design_lead_from_its_files_to_one_result(asked, tmp_path):
+    designed = rig("design", asked, *MOST, "--out", "designs/d", cwd=tmp_path)
+    assert designed.returncode == 0, designed.stderr
+    commands = printed_commands(designed.stdout)
+    assert [command.split()[1] for command in commands] == ["check", "run", "identify"]
+    written = (tmp_path / "designs" / "d" / "commands.txt").read_text()
+    assert [line for line in written.splitlines() if line.startswith("rig ")] == commands
+    checked, run, identified = (
+        rig(*shlex.split(command)[1:], cwd=tmp_path, timeout=300) for command in commands
+    )
+    assert (checked.returncode, run.returncode, identified.returncode) == (0, 0, 0)
+    assert checked.stdout.count("1000 samples at 800 Hz") == 2
+    assert printed_commands(checked.stdout) == commands[1:]
+    assert printed_commands(run.stdout) == commands[2:]
+    result = yaml.safe_load((tmp_path / printed_file(identified.stdout)).read_text())
+    names = [log["name"] for log in result["metrics"]["training"]]
+    assert [name.partition("-")[2] for name in names] == ["designed-1", "designed-2"]
+    assert result["parameters"]["J_m"]["source"].startswith("id.yaml:")
+    alone = rig("run", "designs/d/designed-1.yaml", cwd=tmp_path)
+    assert printed_commands(alone.stdout) == commands[1:]
+    there = rig("run", "designed-1.yaml", cwd=tmp_path / "designs" / "d")
+    assert "whose runs are identified together: commands.txt" in there.stdout
+
+
+def printed_file(text):
+    """Where the parameters were written."""
+    (line,) = [
+        line for line in text.splitlines() if line.startswith("Parameters: ") and "/" in line
+    ]
+    return line.partition(": ")[2]
+
+
+@pytest.mark.soak
+def test_a_later_design_is_identified_with_the_logs_before_it(asked, tmp_path):
+    rig("design", asked, "--out", "d", cwd=tmp_path)
+    rig("run", "d", "--out", "runs/d", cwd=tmp_path)
+    rig("identify", "runs/d", "--config", "id.yaml", "--out", "first", cwd=tmp_path)
+    finer = ["--parameters", "first", "--set", "targets.K_m=0.01", "--out", "e"]
+    again = rig("design", asked, *finer, cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    last = printed_commands(again.stdout)[-1]
+    logs = sorted(str(log.relative_to(tmp_path)) for log in tmp_path.glob("runs/d/*"))
+    assert last == f"rig identify {' '.join(logs)} runs/e --config id.yaml --model actuator"
+    for log in logs:
+        shutil.rmtree(tmp_path / log)
+    again = rig("design", asked, *finer[:-1], "f", cwd=tmp_path)
+    last = printed_commands(again.stdout)[-1]
+    assert (
+        last
+        == "rig identify runs/f --given first/parameters.yaml --config id.yaml --model actuator"
+    )
+
+
+@pytest.mark.soak
+def test_what_is_printed_as_equal_is_met_and_what_is_narrowed_is_not_unknown(asked, tmp_path):
+    first = rig("design", asked, "--json", "--out", "d", cwd=tmp_path)
+    exact = {q["name"]: 100.0 * q["after"] for q in json.loads(first.stdout)["quantities"]}
+    # Wanted: of K_m so little more than will be had that both print alike, of R_m far more.
+    equal, finer = float(f"{exact['K_m']:.2g}"), 0.2 * exact["R_m"]
+    for k_m in (equal, equal / 1.001):
+        targets = ["--set", f"targets.K_m={k_m}", "--set", f"targets.R_m={finer}"]
+        once = ["--set", "time=1.25 s", *targets]
+        done = rig("design", asked, *once, "--out", "e", cwd=tmp_path)
+        document = json.loads((tmp_path / "e" / "design.json").read_text())
+        quantities = {q["name"]: q for q in document["quantities"]}
+        for name, wanted in (("K_m", k_m), ("R_m", finer)):
+            after = float(f"{100.0 * quantities[name]['after']:.2g}")
+            assert quantities[name]["met"] == (after <= wanted)
+        short = [q["name"] for q in document["quantities"] if q["name"] in document["short"]]
+        assert short == [name for name in ("R_m", "K_m") if not quantities[name]["met"]]
+        assert not {"R_m", "K_m"} & {n for u in document["unknown"] for n in u["names"]}
+        line = next(line for line in done.stdout.splitlines() if line.startswith("Narrowed, but"))
+        assert all(name in line for name in short)
+
+
+@pytest.mark.soak
+def test_designed_files_are_right_from_any_folder(asked, tmp_path):
+    write_yaml(tmp_path / "rig.yaml", {"backend": "simulated"})
+    for place in ("d", "project/d"):
+        done = rig("design", asked, "--rig", "rig.yaml", "--out", place, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        folder = tmp_path / place
+        checked = rig("check", "designed-1.yaml", "--json", cwd=folder)
+        assert checked.returncode == 0, checked.stderr
+        first = (folder / "designed-1.yaml").read_text().splitlines()[0]
+        schema = folder / first.partition("$schema=")[2]
+        assert "protocol" in json.loads(schema.read_text())["properties"]
+        rig("schema", "project/schemas", cwd=tmp_path)
+    assert "$schema=../schemas/experiment.json" in first
+
+
+@pytest.mark.soak
+def test_a_design_that_limits_stop_says_how_to_go_on(asked, tmp_path):
+    rig("design", asked, *MOST, "--out", "d", cwd=tmp_path)
+    slow = {"backend": "simulated", "limits": {"speed": 0.5}}
+    write_yaml(tmp_path / "slow.yaml", slow)
+    done = rig("run", "d", "--rig", "slow.yaml", "--out", "r", cwd=tmp_path)
+    assert done.returncode == 1
+    rest = "rig run d/designed-1.yaml d/designed-2.yaml --rig slow.yaml --out r"
+    assert f"0 of 2 runs were completed; go on with: {rest}" in done.stderr
+
+
+def test_a_folder_without_a_design_is_refused(tmp_path):
+    for command in ("run", "check"):
+        done = rig(command, ".", cwd=tmp_path)
+        assert done.returncode == 2
+        assert "no design was written there; name an experiment's file, or a folder" in done.stderr
+
+
+def test_several_experiments_are_checked_before_any_is_run(tmp_path):
+    write_experiment(tmp_path / "wrong.yaml", sample_rat=800)
+    done = rig("run", "prbs.yaml", "wrong.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert ": sample_rat: unknown key" in done.stderr
+    assert not (tmp_path / "runs").exists()
+    done = rig("run", "prbs.yaml", "sine.yaml", "--identify", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--identify: it identifies from one experiment" in done.stderr
+    done = rig("run", "prbs.yaml", "sine.yaml", "--json", cwd=tmp_path)
+    runs = json.loads(done.stdout)["runs"]
+    assert [run["run"]["folder"].partition("-")[2] for run in runs] == ["prbs", "sine"]
+
+
+def test_a_rig_that_an_experiment_names_in_vain_is_told_with_its_line(tmp_path):
+    write_experiment(tmp_path / "e.yaml", rig="rig.yaml", sample_rat=1)
+    text = (tmp_path / "e.yaml").read_text().splitlines()
+    line = {key: 1 + next(k for k, at in enumerate(text) if at.startswith(f"{key}:"))
+            for key in ("rig", "sample_rat")}  # fmt: skip
+    done = rig("check", "e.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"e.yaml:{line['rig']}:1: rig: rig.yaml: there is no such file; " in done.stderr
+    assert f"e.yaml:{line['sample_rat']}:1: sample_rat: unknown key" in done.stderr
 
 
 @pytest.mark.soak
