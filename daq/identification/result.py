@@ -93,7 +93,7 @@ class Identification(Shown):
     >>> from daq import identify, record
     >>> result = identify(record("prbs.yaml"), preset="thesis", generations=2)
     >>> result.save("results").name, list(result.metrics.columns)
-    ('parameters.yaml', ['rmse', 'msd', 'fit_percent', 'rmse_absolute', 'msd_absolute', 'unit'])
+    ('parameters.yaml', ['fit_percent', 'rmse_absolute', 'rmse', 'msd', 'msd_absolute', 'unit'])
     """
 
     problem: Problem
