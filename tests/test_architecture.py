@@ -84,7 +84,7 @@ def test_no_room_is_for_leftovers():
 
 
 def test_rooms_and_floors_of_sysid():
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]
     (layers,) = (
         contract["layers"]
         for contract in contracts["contracts"]

@@ -293,7 +293,9 @@ class _Server:
         err.unlink(missing_ok=True)
         status = int(self._answer(words, cwd, env, out, err, timeout))
         assert status != -signal.SIGALRM, f"rig {words} has not ended within {timeout} s"
-        return subprocess.CompletedProcess(words, status, out.read_text(), err.read_text())
+        return subprocess.CompletedProcess(
+            words, status, out.read_text("utf-8"), err.read_text("utf-8")
+        )
 
     def start(self, words, cwd, env=None):
         """Begin one and leave it running: a Started, whose pipes are named for a moment."""
@@ -513,7 +515,7 @@ def install(folder, module, text, group, name, attribute):
 
 
 def journal_of(path):
-    return [json.loads(line) for line in Path(path).read_text().splitlines()]
+    return [json.loads(line) for line in Path(path).read_text("utf-8").splitlines()]
 
 
 SLIDE = """

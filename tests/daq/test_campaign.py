@@ -104,7 +104,7 @@ def test_every_log_with_every_model_and_seed(folder):
     assert list(table["tau"]) == pytest.approx([r["tau"] for r in rows], rel=1e-12)
     # The best of each is a result like that of `rig identify`.
     best = next(s for s in document["spread"] if s["model"] == LAG and s["data"] == "slow")
-    kept = yaml.safe_load((folder / best["parameters_file"]).read_text())
+    kept = yaml.safe_load((folder / best["parameters_file"]).read_text("utf-8"))
     assert kept["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=0.02)
     assert kept["metrics"]["training"][0]["name"] == "slow"
     assert kept["metrics"]["validation"][0]["name"] == "check"
@@ -149,7 +149,7 @@ def test_one_parameter_set_for_all_logs_together(folder):
     assert [(r["data"], r["seed"]) for r in document["runs"]] == [("2 logs", 0), ("2 logs", 1)] * 2
     assert 0.1 < document["runs"][0]["tau"] < 0.2
     path = folder / document["spread"][0]["parameters_file"]
-    kept = yaml.safe_load(path.read_text())
+    kept = yaml.safe_load(path.read_text("utf-8"))
     validated = [entry["name"] for entry in kept["metrics"]["validation"]]
     assert validated == ["fast (last 30 %)", "slow (last 30 %)", "check"]
 

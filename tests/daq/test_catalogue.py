@@ -90,7 +90,7 @@ def test_a_run_is_listed_with_what_it_was_and_what_came_of_it(lab):
     assert second["metadata"] == {"operator": "Bob", "note": "brushes replaced"}
     assert third["metadata"] == {"operator": "Ann", "tags": ["new", "warm"], "temperature": 30}
     parameters = yaml.safe_load(
-        (lab / "runs" / first["folder"] / "identification" / "parameters.yaml").read_text()
+        (lab / "runs" / first["folder"] / "identification" / "parameters.yaml").read_text("utf-8")
     )
     gain = next(row for row in first["quantities"] if row["name"] == "gain")
     assert gain["value"] == parameters["parameters"]["gain"]["value"]
@@ -180,7 +180,7 @@ def test_the_axis_of_dates_has_marks_for_runs_however_far_apart(lab, tmp_path, m
     for capture in captures(lab):
         shutil.copytree(lab / capture, tmp_path / capture)
     record = tmp_path / captures(lab)[0] / "run.json"
-    content = json.loads(record.read_text())
+    content = json.loads(record.read_text("utf-8"))
     earlier = datetime.datetime.fromisoformat(content["started"])
     content["started"] = (earlier - datetime.timedelta(minutes=minutes)).isoformat()
     record.write_text(json.dumps(content))
@@ -252,7 +252,9 @@ def test_runs_without_samples_are_left_out_of_a_figure_and_of_an_identification(
     for capture in captures(lab):
         shutil.copytree(lab / capture, tmp_path / capture)
     log = tmp_path / captures(lab)[2] / "log.csv"
-    log.write_text(log.read_text().partition("\n")[0] + "\n")  # it failed before the first sample
+    log.write_text(
+        log.read_text("utf-8").partition("\n")[0] + "\n"
+    )  # it failed before the first sample
     result = rig("runs", "--plot", "all.png", cwd=tmp_path)
     assert result.returncode == 0 and "Figure: all.png" in result.stdout
     assert "its signals are not drawn: " in result.stderr
@@ -272,11 +274,11 @@ def test_numbers_and_dates_that_were_edited_into_nonsense_end_no_listing(lab, tm
     for capture in (first, second):
         shutil.copytree(lab / capture, tmp_path / capture)
     result = tmp_path / first / "identification" / "parameters.yaml"
-    content = yaml.safe_load(result.read_text())
+    content = yaml.safe_load(result.read_text("utf-8"))
     content["parameters"]["gain"]["interval"] = ["abc", 1.0]
     result.write_text(yaml.safe_dump(content))
     record = tmp_path / second / "run.json"
-    record.write_text(json.dumps({**json.loads(record.read_text()), "started": {"a": 1}}))
+    record.write_text(json.dumps({**json.loads(record.read_text("utf-8")), "started": {"a": 1}}))
     for words in (("--parameters", "gain"), ("--compare", "--plot", "all.png")):
         seen = rig("runs", *words, cwd=tmp_path)
         assert seen.returncode == 0, seen.stderr
@@ -288,7 +290,7 @@ def test_tags_and_notes_are_put_on_runs_and_taken_away(lab):
     (run,) = listed(lab, "brushes", "--tag", "ageing", "--note", "operator=", "--note", "brake=3")
     assert run["metadata"] == {"note": "brushes replaced", "tags": ["ageing"], "brake": 3}
     path = lab / "runs" / run["folder"] / "metadata.yaml"
-    assert yaml.safe_load(path.read_text()) == run["metadata"]
+    assert yaml.safe_load(path.read_text("utf-8")) == run["metadata"]
     (again,) = listed(
         lab, "brake=3", "--untag", "ageing", "--note", "brake=", "--note", "operator=Bob"
     )
@@ -298,7 +300,7 @@ def test_tags_and_notes_are_put_on_runs_and_taken_away(lab):
 
 def test_what_is_edited_by_hand_counts_at_once(lab):
     path = lab / "runs" / listed(lab)[0]["folder"] / "metadata.yaml"
-    before = path.read_text()
+    before = path.read_text("utf-8")
     path.write_text(before + "humidity: 40\n")
     assert len(listed(lab, "humidity=40")) == 1
     path.write_text(before)

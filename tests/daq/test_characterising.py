@@ -50,7 +50,7 @@ def test_it_uses_the_time_and_tells_the_parameters(finished):
     assert document["ended"] == "the 1.5 s are used up"
     widths = {q["name"]: q["width"] for q in document["quantities"]}
     assert widths.keys() == {"R_m", "K_m", "B_m"}
-    page = (folder / "c" / "characterise.html").read_text()
+    page = (folder / "c" / "characterise.html").read_text("utf-8")
     assert "the 1.5 s are used up" in page and document["verdict"]["parameters"]["trust"] in page
     for quantity in document["quantities"]:
         assert f'data-value="{quantity["value"]!r}"' in page
@@ -62,7 +62,9 @@ def test_the_model_and_what_its_values_rest_on_are_named(folder):
     assert shown.returncode == 0, shown.stderr
     (sentence,) = actuator(limits=True).assumptions
     page, report = (
-        html.unescape(re.sub(r"\s+", " ", (folder / "c" / name).read_text().replace("<wbr>", "")))
+        html.unescape(
+            re.sub(r"\s+", " ", (folder / "c" / name).read_text("utf-8").replace("<wbr>", ""))
+        )
         for name in ("characterise.html", "report/report.html")
     )
     for text in (" ".join(shown.stdout.split()), page, report):
@@ -113,14 +115,14 @@ def test_more_time_given_with_resume_is_recorded_and_used(finished, tmp_path):
     marks = {words[0]: words[-1] for line in done.stdout.splitlines() if (words := line.split())}
     assert (marks["K_m"], marks["B_m"]) == ("met", "missed")
     assert "Wider than the 0.9 % wanted: " in done.stdout
-    page = (tmp_path / "c" / "characterise.html").read_text()
+    page = (tmp_path / "c" / "characterise.html").read_text("utf-8")
     assert page.count("<td>met</td>") + page.count("<td>missed</td>") == len(marks.keys() & FREE)
     assert "rig characterise --resume c --time 5" in done.stdout
 
 
 def test_an_option_that_resuming_cannot_change_is_refused(finished, tmp_path):
     shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
-    before = (tmp_path / "c" / "characterise.json").read_text()
+    before = (tmp_path / "c" / "characterise.json").read_text("utf-8")
     for more, named in (
         (["simulated.yaml"], "RIG.yaml"),
         (["--model", "actuator", "--set", "run=1 s"], "--model, --set"),
@@ -132,7 +134,7 @@ def test_an_option_that_resuming_cannot_change_is_refused(finished, tmp_path):
         assert done.returncode == 2
         assert f"c: {named} cannot be changed on resuming" in done.stderr
         assert "leave out all but --time, --precision and --ask" in done.stderr
-    assert (tmp_path / "c" / "characterise.json").read_text() == before
+    assert (tmp_path / "c" / "characterise.json").read_text("utf-8") == before
 
 
 def test_a_later_round_begins_where_the_last_one_left_no_quantity_without_an_end(
@@ -147,7 +149,7 @@ def test_a_later_round_begins_where_the_last_one_left_no_quantity_without_an_end
         ([0.1, None], True),
         (None, False),
     ):
-        content = yaml.safe_load(file.read_text())
+        content = yaml.safe_load(file.read_text("utf-8"))
         content["parameters"]["K_m"]["interval"] = ends
         file.write_text(yaml.safe_dump(content))
         earlier = first.as_earlier_fit
@@ -159,7 +161,7 @@ def test_a_later_round_begins_where_the_last_one_left_no_quantity_without_an_end
 
 def test_each_run_has_noise_of_its_own(finished):
     logs = sorted((finished[0] / "c").rglob("log.csv"))
-    noise = {json.dumps(json.loads(run.read_text())["calibration"]["noise"]) for run in (
+    noise = {json.dumps(json.loads(run.read_text("utf-8"))["calibration"]["noise"]) for run in (
         log.parent / "run.json" for log in logs
     )}  # fmt: skip
     assert len(noise) == len(logs) > 1

@@ -71,7 +71,7 @@ def test_the_installed_command_is_the_module(tmp_path):
         encoding="utf-8", check=True,
     )  # fmt: skip
     assert installed.stdout == rig("models", cwd=tmp_path).stdout
-    version = re.search(r'^version = "(.+)"', PROJECT.read_text(), re.M)[1]
+    version = re.search(r'^version = "(.+)"', PROJECT.read_text("utf-8"), re.M)[1]
     assert rig("--version", cwd=tmp_path).stdout == f"hybrid-rig {version}\n"
 
 
@@ -105,7 +105,7 @@ def test_json_of_identify_check_models_and_replay(captured, tmp_path):
     assert identified.returncode == 0, identified.stderr
     report = json.loads(identified.stdout)
     assert report["model"] == "actuator" and report["error"]["value"] > 0.0
-    kept = yaml.safe_load((out / "parameters.yaml").read_text())
+    kept = yaml.safe_load((out / "parameters.yaml").read_text("utf-8"))
     assert kept["parameters"]["K_m"]["value"] == report["parameters"]["K_m"]["value"]
 
     replayed = rig("replay", folder, "--parameters", out / "parameters.yaml", "--json", cwd=root)
@@ -283,7 +283,7 @@ def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
     result = rig("identify", "bench.csv", "--config", "../id.yaml", "--out", "../found", cwd=work)
     assert result.returncode == 0, result.stderr
     assert "Parameters of lag" in result.stdout
-    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text("utf-8"))
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
     assert found["metrics"]["training"][0]["outputs"]["y"]["max_abs"] == pytest.approx(1.0, rel=0.1)
     # The command that it suggests works as it stands.
@@ -296,7 +296,7 @@ def test_a_model_and_a_csv_of_ones_own_work_like_the_built_in(tmp_path):
 @pytest.mark.soak
 def test_a_log_whose_columns_are_called_as_the_model_calls_them_needs_no_mapping(tmp_path):
     foreign_log(tmp_path / "bench.csv")
-    _, *rows = (tmp_path / "bench.csv").read_text().splitlines()
+    _, *rows = (tmp_path / "bench.csv").read_text("utf-8").splitlines()
     numbers = np.array([row.split(",") for row in rows], dtype=float) * [1e-3, -1.0, 1e-3]
     named = [f"{y!r},{t!r},{u!r},0.003" for t, u, y in numbers.tolist()]
     (tmp_path / "mine.csv").write_text("\n".join(["y,t,u,bias", *named]) + "\n")
@@ -305,7 +305,7 @@ def test_a_log_whose_columns_are_called_as_the_model_calls_them_needs_no_mapping
     more = "--generations", 8, "--out", "found"
     result = rig(*command, *more, cwd=tmp_path, report=True)
     assert result.returncode == 0, result.stderr
-    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text("utf-8"))
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
     assert (tmp_path / "found" / "figures" / "signals.svg").exists()
     (line,) = [s for s in result.stdout.splitlines() if s.startswith("Next: rig ")]
@@ -320,7 +320,7 @@ def test_a_log_whose_columns_are_called_as_the_model_calls_them_needs_no_mapping
 @pytest.mark.soak
 def test_uneven_times_and_cells_without_a_number_are_taken_as_they_are(tmp_path):
     foreign_log(tmp_path / "even.csv")
-    head, *rows = (tmp_path / "even.csv").read_text().splitlines()
+    head, *rows = (tmp_path / "even.csv").read_text("utf-8").splitlines()
     kept = [row for k, row in enumerate(rows) if k % 7 not in {2, 3} or k % 20 == 0]
     for k in (0, 9):
         kept[k] = kept[k].rsplit(",", 1)[0] + ", "
@@ -339,7 +339,7 @@ def test_uneven_times_and_cells_without_a_number_are_taken_as_they_are(tmp_path)
     (tmp_path / "id.yaml").write_text(OWN_CONFIG.replace("unit: ms", "unit: ms, grid: 10 ms"))
     result = rig(*command, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text("utf-8"))
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
 
 
@@ -378,7 +378,7 @@ def test_an_output_that_does_not_count_needs_no_column(tmp_path):
                  "--set", "initial={y: 0.0}", "--set", "hold={u: zoh}", "--out", "found",
                  cwd=tmp_path)  # fmt: skip
     assert result.returncode == 0, result.stderr
-    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text("utf-8"))
     assert found["outputs"] == ["y"] and found["initial"] == {"y": 0.0}
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.2, rel=1e-3)
     (line,) = [s for s in result.stdout.splitlines() if s.startswith("Next: rig ")]
@@ -401,7 +401,7 @@ def test_the_end_of_each_log_is_held_back(captured, tmp_path):
         assert entry["name"] == f"{folder.name} ({share})"
         assert entry["outputs"]["omega"]["max_abs"] == np.abs(rows["omega"]).max()
     # The same as a log that ends there: what is held back has no part in the search.
-    head = (folder / "log.csv").read_text().splitlines(keepends=True)[:301]
+    head = (folder / "log.csv").read_text("utf-8").splitlines(keepends=True)[:301]
     (tmp_path / "head.csv").write_text("".join(head))
     alone = rig("identify", tmp_path / "head.csv", *small, cwd=root)
     values = [json.loads(r.stdout)["error"]["value"] for r in (result, alone)]
@@ -423,7 +423,7 @@ def test_ranges_from_a_data_sheet_and_from_the_log(captured, tmp_path):
     result = rig("identify", folder, "--config", tmp_path / "id.yaml", "--guess", "--out", out,
                  cwd=root)  # fmt: skip
     assert result.returncode == 0, result.stderr
-    found = yaml.safe_load((out / "parameters.yaml").read_text())["parameters"]
+    found = yaml.safe_load((out / "parameters.yaml").read_text("utf-8"))["parameters"]
     sheet = tmp_path / "motor.yaml"
     assert found["R_m"]["source"] == f"{sheet}:1 (S23 data sheet)"
     assert found["R_m"]["range"] == pytest.approx([1.062, 1.298])
@@ -452,7 +452,7 @@ def test_the_report_says_where_every_range_came_from(tmp_path):
         "population=20", "--out", "found", cwd=tmp_path,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
-    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text())
+    found = yaml.safe_load((tmp_path / "found" / "parameters.yaml").read_text("utf-8"))
     assert found["search"]["population"] == 20
     parameters = found["parameters"]
     assert {name: entry["source"] for name, entry in parameters.items()} == {
@@ -468,7 +468,7 @@ def test_the_report_says_where_every_range_came_from(tmp_path):
 @pytest.mark.soak
 def test_a_log_without_time_has_its_rate_in_the_configuration(tmp_path):
     foreign_log(tmp_path / "bench.csv")
-    text = (tmp_path / "bench.csv").read_text()
+    text = (tmp_path / "bench.csv").read_text("utf-8")
     lines = [line.split(", ", 1)[1] for line in text.splitlines()]
     (tmp_path / "bench.csv").write_text("\n".join(lines) + "\n")
     (tmp_path / "lag.py").write_text(OWN_MODEL)
@@ -559,7 +559,7 @@ def test_ctrl_c_during_a_search_prints_the_parameters_found_so_far(captured, tmp
     assert asked and status == 0, text + out
     assert "Stopped by Ctrl-C after" in out and "Parameters of actuator" in out
     assert "Traceback" not in text
-    kept = yaml.safe_load((tmp_path / "o" / "parameters.yaml").read_text())
+    kept = yaml.safe_load((tmp_path / "o" / "parameters.yaml").read_text("utf-8"))
     assert kept["search"]["stopped"] == "interrupted" and len(kept["parameters"]) == 21
     assert kept["search"]["generations"] >= asked[0]
 

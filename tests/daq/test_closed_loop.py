@@ -136,7 +136,9 @@ def test_what_the_protocol_concludes_is_written_and_shown(run, tmp_path):
     table = pd.read_csv(results / "angle.csv")
     np.testing.assert_array_equal(table["theta"], log["theta"])
     assert (results / "angle.png").stat().st_size > 1000
-    assert yaml.safe_load((results / "ranges.yaml").read_text())["ranges"] == {"K_m": [0.1, 0.2]}
+    assert yaml.safe_load((results / "ranges.yaml").read_text("utf-8"))["ranges"] == {
+        "K_m": [0.1, 0.2]
+    }
     folder = only_capture(tmp_path).relative_to(tmp_path)
     again = rig("analyse", folder, "--trust", "--json", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
@@ -181,7 +183,7 @@ def test_commands_beyond_the_rig_are_refused_before_anything_moves(run, tmp_path
 def test_an_excitation_concludes_nothing(run, tmp_path):
     assert run().returncode == 0
     folder = only_capture(tmp_path)
-    record = json.loads((folder / "run.json").read_text())
+    record = json.loads((folder / "run.json").read_text("utf-8"))
     assert not math.isnan(record["experiment"]["stiffness"])
     record["experiment"]["protocol"] = "prbs"
     (folder / "run.json").write_text(json.dumps(record))

@@ -162,7 +162,10 @@ def test_a_design_for_a_free_shaft_writes_loops_that_run(tmp_path):
     assert done.returncode == 0, done.stderr
     (designed,) = json.loads(done.stdout)["runs"]
     assert designed["protocol"] in LOOPS and designed["seconds"] <= 2.5
-    assert yaml.safe_load((tmp_path / designed["file"]).read_text())["torque_sensor"] == "between"
+    assert (
+        yaml.safe_load((tmp_path / designed["file"]).read_text("utf-8"))["torque_sensor"]
+        == "between"
+    )
     ran = rig("run", designed["file"], "--json", cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     run = json.loads(ran.stdout)["run"]

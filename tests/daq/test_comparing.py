@@ -104,12 +104,12 @@ def test_structures_and_a_linear_model_are_ranked_on_validation(folder):
     assert rows[LAG]["dbic"] < rows["ARMAX"]["dbic"] < rows[DOUBLE]["dbic"]
     assert report["verdict"].count("times those of") == 4
     # What is printed is kept, and each model's result is one that other commands read.
-    kept = yaml.safe_load((folder / report["files"]["comparison"]).read_text())
+    kept = yaml.safe_load((folder / report["files"]["comparison"]).read_text("utf-8"))
     assert kept["structures"] == report["structures"]
     for name in (DOUBLE, TWOFOLD, LAG):
         parameters = folder / rows[name]["parameters_file"]
-        assert short(yaml.safe_load(parameters.read_text())["model"]) == name
-    found = yaml.safe_load((folder / rows[LAG]["parameters_file"]).read_text())
+        assert short(yaml.safe_load(parameters.read_text("utf-8"))["model"]) == name
+    found = yaml.safe_load((folder / rows[LAG]["parameters_file"]).read_text("utf-8"))
     assert found["parameters"]["tau"]["value"] == pytest.approx(0.1, rel=0.02)
 
 
@@ -122,7 +122,7 @@ def test_tables_for_people_and_a_page_that_says_how_to_do_it_again(folder):
     assert "Page: found/comparison.html\n" in text and page.open == []
     assert not {"script", "link", "img"} & set(page.tags)
     assert {"figure-ratios", "figure-validation"} <= set(page.ids)
-    kept = yaml.safe_load((folder / "found/comparison.yaml").read_text())
+    kept = yaml.safe_load((folder / "found/comparison.yaml").read_text("utf-8"))
     assert kept["preferred"] == LAG and f"{LAG} is preferred." in page.text
     shown = {given["data-structure"]: values for given, values in page.rows
              if "data-structure" in given}  # fmt: skip

@@ -304,7 +304,7 @@ def test_errors_stand_in_physical_units_everywhere(folder):
     words = ("identify", "day1.csv", "--validate", "day2.csv", "--config", "id.yaml")
     result = rig(*words, "--out", "results", cwd=folder, report=True)
     assert result.returncode == 0, result.stderr
-    document = json.loads((folder / "results" / "report.json").read_text())
+    document = json.loads((folder / "results" / "report.json").read_text("utf-8"))
     (log,) = document["metrics"]["validation"]
     errors = log["outputs"]["y"]
     expected = errors["rmse"] * errors["max_abs"]
@@ -312,9 +312,9 @@ def test_errors_stand_in_physical_units_everywhere(folder):
     rows = pd.read_csv(folder / "results" / "errors.csv")
     row = rows[rows["part"] == "validation"].iloc[0]
     assert row["rmse_absolute"] == pytest.approx(expected) and row["unit"] == "m"
-    page = (folder / "results" / "report.html").read_text()
+    page = (folder / "results" / "report.html").read_text("utf-8")
     assert f'data-value="{errors["rmse_absolute"]!r}"' in page and 'data-log="day2"' in page
-    assert r"\begin{tabular}" in (folder / "results" / "errors.tex").read_text()
+    assert r"\begin{tabular}" in (folder / "results" / "errors.tex").read_text("utf-8")
     assert " mm " in result.stdout
 
 

@@ -218,7 +218,7 @@ def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path)
     done = rig("design", asked, "--out", "d", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
-    assert json.loads((tmp_path / "d" / "design.json").read_text()) == document
+    assert json.loads((tmp_path / "d" / "design.json").read_text("utf-8")) == document
     assert (tmp_path / "d" / "design.png").stat().st_size > 10_000
     by_name = {quantity["name"]: quantity for quantity in document["quantities"]}
     assert by_name.keys() == {"R_m", "K_m", "B_m"}
@@ -247,7 +247,7 @@ def test_the_commands_of_a_design_lead_from_its_files_to_one_result(asked, tmp_p
     assert designed.returncode == 0, designed.stderr
     commands = printed_commands(designed.stdout)
     assert [command.split()[1] for command in commands] == ["check", "run", "identify"]
-    written = (tmp_path / "designs" / "d" / "commands.txt").read_text()
+    written = (tmp_path / "designs" / "d" / "commands.txt").read_text("utf-8")
     assert [line for line in written.splitlines() if line.startswith("rig ")] == commands
     checked, run, identified = (
         rig(*shlex.split(command)[1:], cwd=tmp_path, timeout=300) for command in commands
@@ -256,7 +256,7 @@ def test_the_commands_of_a_design_lead_from_its_files_to_one_result(asked, tmp_p
     assert checked.stdout.count("1000 samples at 800 Hz") == 2
     assert printed_commands(checked.stdout) == commands[1:]
     assert printed_commands(run.stdout) == commands[2:]
-    result = yaml.safe_load((tmp_path / printed_file(identified.stdout)).read_text())
+    result = yaml.safe_load((tmp_path / printed_file(identified.stdout)).read_text("utf-8"))
     names = [log["name"] for log in result["metrics"]["training"]]
     assert [name.partition("-")[2] for name in names] == ["designed-1", "designed-2"]
     assert result["parameters"]["J_m"]["source"].startswith("id.yaml:")
@@ -305,7 +305,7 @@ def test_what_is_printed_as_equal_is_met_and_what_is_narrowed_is_not_unknown(ask
         targets = ["--set", f"targets.K_m={k_m}", "--set", f"targets.R_m={finer}"]
         once = ["--set", "time=1.25 s", *targets]
         done = rig("design", asked, *once, "--out", "e", cwd=tmp_path)
-        document = json.loads((tmp_path / "e" / "design.json").read_text())
+        document = json.loads((tmp_path / "e" / "design.json").read_text("utf-8"))
         quantities = {q["name"]: q for q in document["quantities"]}
         for name, wanted in (("K_m", k_m), ("R_m", finer)):
             after = float(f"{100.0 * quantities[name]['after']:.2g}")
@@ -326,9 +326,9 @@ def test_designed_files_are_right_from_any_folder(asked, tmp_path):
         folder = tmp_path / place
         checked = rig("check", "designed-1.yaml", "--json", cwd=folder)
         assert checked.returncode == 0, checked.stderr
-        first = (folder / "designed-1.yaml").read_text().splitlines()[0]
+        first = (folder / "designed-1.yaml").read_text("utf-8").splitlines()[0]
         schema = folder / first.partition("$schema=")[2]
-        assert "protocol" in json.loads(schema.read_text())["properties"]
+        assert "protocol" in json.loads(schema.read_text("utf-8"))["properties"]
         rig("schema", "project/schemas", cwd=tmp_path)
     assert "$schema=../schemas/experiment.json" in first
 
@@ -367,7 +367,7 @@ def test_several_experiments_are_checked_before_any_is_run(tmp_path):
 
 def test_a_rig_that_an_experiment_names_in_vain_is_told_with_its_line(tmp_path):
     write_experiment(tmp_path / "e.yaml", rig="rig.yaml", sample_rat=1)
-    text = (tmp_path / "e.yaml").read_text().splitlines()
+    text = (tmp_path / "e.yaml").read_text("utf-8").splitlines()
     line = {key: 1 + next(k for k, at in enumerate(text) if at.startswith(f"{key}:"))
             for key in ("rig", "sample_rat")}  # fmt: skip
     done = rig("check", "e.yaml", cwd=tmp_path)
@@ -391,7 +391,9 @@ def test_a_designed_run_passes_no_limit_and_is_identified(asked, tmp_path):
     finer = ["--set", "targets.K_m=0.001", "--out", "e", "--json"]
     again = rig("design", asked, *known, *finer, cwd=tmp_path)
     assert "noise is assumed" not in again.stderr
-    before, after = (json.loads((tmp_path / name / "design.json").read_text()) for name in "de")
+    before, after = (
+        json.loads((tmp_path / name / "design.json").read_text("utf-8")) for name in "de"
+    )
     for first, second in zip(before["quantities"], after["quantities"], strict=True):
         assert second["before"] < first["before"]
 

@@ -110,7 +110,7 @@ def record(run, folder, act="", **options):
 def truth(run, tmp_path_factory):
     root = tmp_path_factory.mktemp("alone")
     assert record(run, root).returncode == 0
-    return (only_capture(root) / "log.csv").read_text().splitlines()
+    return (only_capture(root) / "log.csv").read_text("utf-8").splitlines()
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_a_log_whose_rows_are_all_there_is_put_together_again(run, tmp_path, tru
     said = f"log.csv: it was {what} while the run was on; {aside}nothing of it is lost"
     assert said in result.stderr
     folder = only_capture(tmp_path)
-    assert (folder / "log.csv").read_text().splitlines() == truth
+    assert (folder / "log.csv").read_text("utf-8").splitlines() == truth
     strangers = ["log.csv.stranger"] if aside else []
     assert sorted(path.name for path in folder.iterdir()) == ["log.csv", *strangers, "run.json"]
     assert record_of(folder)["status"] == "failed"
@@ -145,7 +145,7 @@ def test_rows_that_nobody_has_are_named_and_all_others_kept(run, tmp_path, truth
     assert result.returncode == 1 and "Traceback" not in result.stderr
     reason = record_of(only_capture(tmp_path))["reason"]
     first, last = map(int, reason.partition("rows ")[2].partition(" (")[0].split(" to "))
-    log = (only_capture(tmp_path) / "log.csv").read_text().splitlines()
+    log = (only_capture(tmp_path) / "log.csv").read_text("utf-8").splitlines()
     assert log == truth[: first + 1] + truth[last + 2 :]
     ends = {"truncate": 400_000, "empty": 0, "overwrite": 500_000}
     n_whole = len("\n".join(truth)[: ends[act]].splitlines()) - 2
@@ -159,7 +159,7 @@ def test_a_log_deleted_in_a_long_run_is_noticed_at_once(tmp_path):
     write_experiment(tmp_path / "e.yaml", duration=60)
     write_rig(tmp_path / "rig.yaml", options={"time": "real"})
     process, folder = run_in_progress(tmp_path)
-    before = (folder / "log.csv").read_text().splitlines()
+    before = (folder / "log.csv").read_text("utf-8").splitlines()
     (folder / "log.csv").unlink()
     until((folder / "log-2.csv").exists, "the run to go on elsewhere")
     process.send_signal(signal.SIGTERM)
@@ -168,7 +168,7 @@ def test_a_log_deleted_in_a_long_run_is_noticed_at_once(tmp_path):
     assert "rig: warning: log.csv was deleted" in errors and "log-2.csv" in errors
     reason = record_of(folder)["reason"]
     assert reason.startswith("stopped by SIGTERM during run; log.csv: it was deleted")
-    assert (folder / "log.csv").read_text().startswith("\n".join(before[:-1]))
+    assert (folder / "log.csv").read_text("utf-8").startswith("\n".join(before[:-1]))
     assert np.all(np.diff(load(folder).frame["tick"]) == 1)
 
 
@@ -254,7 +254,7 @@ def test_a_signal_at_any_instant_of_writing_disturbs_no_log(tmp_path, deleted, m
             signal_at = Signal(n)
             with contextlib.suppress(Interrupted), signal_at:
                 log.append(_samples(2))
-        whole = path.read_text()
+        whole = path.read_text("utf-8")
         header, *rows = whole.splitlines()
         column = header.split(",").index("tick")
         ticks = [int(row.split(",")[column]) for row in rows]

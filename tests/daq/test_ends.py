@@ -276,7 +276,7 @@ def children(pid):
     below = []
     for path in Path("/proc").glob("[0-9]*"):
         try:
-            stat = (path / "stat").read_text().rpartition(")")[2].split()
+            stat = (path / "stat").read_text("utf-8").rpartition(")")[2].split()
             words = (path / "cmdline").read_bytes()
         except OSError:
             continue
@@ -298,7 +298,7 @@ def test_workers_end_with_the_program_that_started_them(data, number):
 
     def busy():
         workers = children(process.pid)
-        times = [Path(f"/proc/{pid}/stat").read_text().split()[13] for pid in workers]
+        times = [Path(f"/proc/{pid}/stat").read_text("utf-8").split()[13] for pid in workers]
         return len(times) == 2 and min(map(int, times)) > 2 * ticks and workers
 
     workers = until(busy, "two workers that have been busy for a while", 180)

@@ -248,7 +248,7 @@ def assert_consistent(folder, status, reason):
     assert sorted(path.name for path in folder.iterdir()) == ["log.csv", "run.json"]
     digest = hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
     assert record["log"]["sha256"] == digest
-    rows = (folder / "log.csv").read_text().splitlines()[1:]
+    rows = (folder / "log.csv").read_text("utf-8").splitlines()[1:]
     broken = bool(rows) and "nan" in rows[-1]
     if len(rows) - broken > 1:
         loaded = load(folder)
@@ -418,7 +418,7 @@ def test_with_json_a_failure_is_a_document_too(tmp_path):
     result = rig("check", "bad.yaml", "--json", cwd=tmp_path)
     document = json.loads(result.stdout)
     assert result.returncode == document["exit_status"] == 2
-    lines = (tmp_path / "bad.yaml").read_text().splitlines()
+    lines = (tmp_path / "bad.yaml").read_text("utf-8").splitlines()
     assert [error["key"] for error in document["errors"]] == ["sample_rate", "motor.amplitude"]
     for error in document["errors"]:
         assert error["key"].rpartition(".")[2] in lines[error["line"] - 1]

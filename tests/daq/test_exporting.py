@@ -41,7 +41,7 @@ def test_a_mat_file_has_the_columns_units_and_the_record(capture, frame):
         np.testing.assert_array_equal(found[name], frame[name])
     assert found["units"].torque == "N*m" and not hasattr(found["units"], "flags")
     assert found["dt"] == pytest.approx(1.0 / 800.0)
-    assert json.loads(str(found["record"])) == json.loads((capture / "run.json").read_text())
+    assert json.loads(str(found["record"])) == json.loads((capture / "run.json").read_text("utf-8"))
 
 
 def test_an_identification_reads_the_mat_file(capture, frame):

@@ -76,7 +76,7 @@ SERIAL = {"name": "bench", "backend": "serial", "options": {"port": ""}}
 def copied(run, folder, **changes):
     """The log of a run whose record has been changed."""
     folder.mkdir(exist_ok=True)
-    content = json.loads((run.folder / "run.json").read_text())
+    content = json.loads((run.folder / "run.json").read_text("utf-8"))
     (folder / "run.json").write_text(json.dumps({**content, **changes}))
     (folder / "log.csv").write_bytes(run.path.read_bytes())
     return folder / "log.csv"

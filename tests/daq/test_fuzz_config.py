@@ -58,7 +58,7 @@ SETTINGS = {
 
 
 def content_of(path):
-    return yaml.safe_load(path.read_text())
+    return yaml.safe_load(path.read_text("utf-8"))
 
 
 FILES = [

@@ -29,9 +29,9 @@ def test_the_files_work_as_they_are_and_the_next_commands_are_told(tmp_path):
     checked = rig(*told[-2].split()[2:], cwd=lab)
     assert checked.returncode == 0, checked.stderr
     for name in ("prbs.yaml", "rig.yaml", "identification.yaml"):
-        first, content = (lab / name).read_text().split("\n", 1)
+        first, content = (lab / name).read_text("utf-8").split("\n", 1)
         schema = lab / first.removeprefix("# yaml-language-server: $schema=")
-        jsonschema.validate(yaml.safe_load(content), json.loads(schema.read_text()))
+        jsonschema.validate(yaml.safe_load(content), json.loads(schema.read_text("utf-8")))
 
 
 @pytest.mark.soak
@@ -50,7 +50,7 @@ def test_what_is_there_stays(tmp_path):
     result = rig("init", "--json", cwd=tmp_path)
     assert json.loads(result.stdout)["kept"] == ["rig.yaml"]
     assert json.loads(result.stdout)["written"] == ["prbs.yaml", "identification.yaml"]
-    assert (tmp_path / "rig.yaml").read_text() == "name: mine\n"
+    assert (tmp_path / "rig.yaml").read_text("utf-8") == "name: mine\n"
     again = rig("init", cwd=tmp_path)
     assert again.stdout.count("Kept as it was") == 3
 

@@ -150,7 +150,7 @@ def test_a_log_is_never_overwritten(tmp_path):
     path.write_text("precious")
     with pytest.raises(RunError, match="exists"):
         LogWriter(path)
-    assert path.read_text() == "precious"
+    assert path.read_text("utf-8") == "precious"
 
 
 def test_the_original_programs_format_loads(tmp_path):

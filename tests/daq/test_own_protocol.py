@@ -198,7 +198,7 @@ def test_mistakes_in_findings_leave_the_run_and_name_their_line(written, tmp_pat
         "uneven series": "series 's': its columns must be of one length; x has 2, y has 3 values (",
         "empty range": "ranges: K_m: 2 is not below 1 (",
     }.items():
-        ended = json.loads((folder / "run.json").read_text())
+        ended = json.loads((folder / "run.json").read_text("utf-8"))
         ended["experiment"]["kind"] = kind
         (folder / "run.json").write_text(json.dumps(ended))
         with pytest.raises(RunError) as failed:
@@ -215,7 +215,7 @@ def test_files_beside_an_editable_install_are_the_users(tmp_path, monkeypatch, f
     file.parent.mkdir()
     file.write_text("class Fading:\n    def plan(self):\n        return 1 / 0\n")
     names = {"__name__": "fading"}
-    exec(compile(file.read_text(), str(file), "exec"), names)
+    exec(compile(file.read_text("utf-8"), str(file), "exec"), names)
     monkeypatch.setitem(sys.modules, "fading", SimpleNamespace(__file__=str(file)))
     with pytest.raises(ZeroDivisionError) as failed:
         names["Fading"]().plan()

@@ -146,7 +146,7 @@ def test_a_log_is_merged_moved_cut_and_decimated_and_the_report_shows_it(folder)
     found = result.parameters["value"]
     assert found["gain"] == pytest.approx(GAIN, rel=0.02)
     assert found["tau"] == pytest.approx(TAU, rel=0.05)
-    document = yaml.safe_load((folder / "out" / "parameters.yaml").read_text())
+    document = yaml.safe_load((folder / "out" / "parameters.yaml").read_text("utf-8"))
     entry = document["preparation"][0]
     assert entry["before"]["sample_time"] == pytest.approx(DT)
     assert entry["after"]["sample_time"] == pytest.approx(5 * DT)
@@ -154,7 +154,7 @@ def test_a_log_is_merged_moved_cut_and_decimated_and_the_report_shows_it(folder)
     assert "day1_force.csv" in told and "y 4 ms earlier" in told and "become" in told
     assert any(told in getattr(note, "text", "") for note in notes)
     publish(result, folder / "out")
-    page = (folder / "out" / "report.html").read_text()
+    page = (folder / "out" / "report.html").read_text("utf-8")
     assert 'id="preparation"' in page and "y 4 ms earlier" in page
     for log in ("day1.csv", "day1_force.csv"):
         assert digest(folder / log) in page
@@ -171,7 +171,9 @@ def test_a_long_log_is_searched_by_parts_and_that_is_told(folder):
     values = result.parameters["value"]
     assert values["gain"] == pytest.approx(GAIN, rel=0.01)
     assert values["tau"] == pytest.approx(TAU, rel=0.01)
-    excerpt = yaml.safe_load((folder / "out" / "parameters.yaml").read_text())["search"]["excerpt"]
+    excerpt = yaml.safe_load((folder / "out" / "parameters.yaml").read_text("utf-8"))["search"][
+        "excerpt"
+    ]
     assert (excerpt["samples"], excerpt["of"]) == (2048, 8000)
     assert excerpt["parts"][0] == {"log": str(folder / "long.csv"), "rows": [1, 1024]}
 

@@ -94,7 +94,7 @@ def test_nothing_is_imported_while_a_run_is_on(tmp_path):
     write_rig(tmp_path / "rig.yaml", backend="watched.py:Watched", options={"time": "real"})
     result = rig("run", "e.yaml", "--rig", "rig.yaml", cwd=tmp_path, fresh=True)
     assert result.returncode == 0, result.stderr
-    assert json.loads((tmp_path / "imported.json").read_text()) == []
+    assert json.loads((tmp_path / "imported.json").read_text("utf-8")) == []
 
 
 def spin(run, folder, **settings):

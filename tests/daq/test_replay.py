@@ -109,7 +109,7 @@ def test_rows_of_a_table_side_by_side(rig, capture, tmp_path):
     fits = [each["outputs"]["current_motor"]["fit_percent"] for each in document["models"]]
     # The rig's motor driver is of the order of row C; row A's settles with a fifth of its gain.
     assert fits[0] < 80.0 < fits[1] and document["passed"]
-    figure = (tmp_path / "both.svg").read_text()
+    figure = (tmp_path / "both.svg").read_text("utf-8")
     assert figure.count("<!-- A -->") == figure.count("<!-- C -->") == 1
     gate = ("--fail-under", "current_motor=80")
     failed = rig("replay", capture, *options, *gate, cwd=tmp_path)
@@ -219,7 +219,7 @@ def run_pytest(folder, *options):
 @pytest.fixture
 def lab(tmp_path, capture):
     """A lab's folder with the example of the documentation."""
-    (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
     (tmp_path / "test_my_rig.py").write_text(example)
     write_experiment(tmp_path / "my_prbs.yaml")
     (tmp_path / "log.csv").write_bytes((capture / "log.csv").read_bytes())
@@ -240,11 +240,11 @@ def test_the_documented_example_passes(lab):
 
 @pytest.mark.soak
 def test_a_rig_that_is_another_fails_and_the_seed_is_told(lab):
-    values = yaml.safe_load((lab / "parameters.yaml").read_text())
+    values = yaml.safe_load((lab / "parameters.yaml").read_text("utf-8"))
     values["parameters"]["K_m"] *= 2.0
     (lab / "parameters.yaml").write_text(yaml.safe_dump(values))
     (lab / "test_my_rig.py").write_text(
-        (lab / "test_my_rig.py").read_text()
+        (lab / "test_my_rig.py").read_text("utf-8")
         + "\n\ndef test_that_fails(simulated_rig):\n"
         + "    run = simulated_rig.run('my_prbs.yaml')\n"
         + "    assert run.findings is not None\n"

@@ -102,7 +102,7 @@ def folder(tmp_path_factory):
 def told(identify, folder):
     """The report for people, and what ``parameters.yaml`` says of the same."""
     text = identify("--out", "found")
-    return text, yaml.safe_load((folder / "found" / "parameters.yaml").read_text())
+    return text, yaml.safe_load((folder / "found" / "parameters.yaml").read_text("utf-8"))
 
 
 def row(text, first):
@@ -210,7 +210,7 @@ def test_without_validation_the_residuals_are_those_of_the_training(command, fol
 
 def test_json_is_what_the_file_holds(identify, folder, told):
     document = json.loads(identify("--out", "json", "--json"))
-    kept = yaml.safe_load((folder / "json" / "parameters.yaml").read_text())
+    kept = yaml.safe_load((folder / "json" / "parameters.yaml").read_text("utf-8"))
     assert document.pop("files") == {"parameters": "json/parameters.yaml"}
     assert document == json.loads(json.dumps(kept))
     # And one seed gives one report.
@@ -244,7 +244,7 @@ def test_the_thesis_preset_has_no_intervals_and_says_nothing_of_them(identify, f
     assert "95 % interval" not in text and "act only together" not in text
     assert "Determined: " not in text and "Parameters: limited. " in text
     assert "The parameters have no intervals" in text
-    document = yaml.safe_load((folder / "thesis" / "parameters.yaml").read_text())
+    document = yaml.safe_load((folder / "thesis" / "parameters.yaml").read_text("utf-8"))
     assert not {"ambiguities", "determined_directions", "correlations"} & set(document)
     for entry in document["parameters"].values():
         assert not {"std", "interval", "undetermined"} & set(entry)
@@ -271,7 +271,7 @@ def loaded(folder):
 def record(captured):
     """The run record, put back after the test has written another."""
     path = captured / RUN_NAME
-    text = path.read_text()
+    text = path.read_text("utf-8")
     yield json.loads(text)
     path.write_text(text)
 
@@ -336,7 +336,7 @@ def test_the_ends_of_amplifiers_are_named_with_what_rests_on_them(command, captu
     result = command(("identify", captured, *words), root, report=True)
     assert result.returncode == 0, result.stderr
     assert "Parameters of actuator:limits=true\n" in result.stdout
-    page = (root / "limited" / "report.html").read_text()
+    page = (root / "limited" / "report.html").read_text("utf-8")
     said = " ".join(html.unescape(re.sub("<[^>]*>", "", page)).split())
     assert "Identification of the model “actuator:limits=true”" in said
     assert "dib/dt=sat(vb,24)−Rbib" in re.sub(r"\s", "", said)
@@ -353,10 +353,10 @@ def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captur
     words = ("--model", "actuator", "--config", "tied.yaml", "--out", "tied")
     result = command(("identify", captured, *words), root, report=True)
     assert result.returncode == 0, result.stderr
-    page = (root / "tied" / "report.html").read_text()
+    page = (root / "tied" / "report.html").read_text("utf-8")
     assert re.search(r'data-quantity="[^"]*z\(0\)', page)
     assert "Of 1 start of states in the logs the table has the intervals." in page
-    rows = Rows.of(json.loads((root / "tied" / "report.json").read_text()))
+    rows = Rows.of(json.loads((root / "tied" / "report.json").read_text("utf-8")))
     figure = next(p.figure for p in _parameters(rows) if p.name == "intervals")
     labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert any("alpha" in label for label in labels)

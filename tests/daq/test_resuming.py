@@ -30,7 +30,7 @@ def few(tmp_path_factory):
 
 
 def parameters(folder):
-    report = yaml.safe_load((folder / "parameters.yaml").read_text())
+    report = yaml.safe_load((folder / "parameters.yaml").read_text("utf-8"))
     return {key: value for key, value in report.items() if key != "software"}
 
 
@@ -90,7 +90,7 @@ def test_what_has_changed_meanwhile_is_named(captured, few, tmp_path):
     until((tmp_path / "o" / "search.ckpt").exists, "a checkpoint")
     process.kill()
     process.communicate()
-    lines = log.read_text().splitlines(keepends=True)
+    lines = log.read_text("utf-8").splitlines(keepends=True)
     log.write_text("".join(lines[:-20]))
     result = rig("identify", "--resume", tmp_path / "o", cwd=root)
     assert result.returncode == 2

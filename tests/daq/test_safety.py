@@ -73,7 +73,7 @@ def folder(tmp_path):
     (tmp_path / "steady.yaml").write_text(
         "protocol: steady.py:Steady\nsample_rate: 800\ncalibration: {samples: 100}\n"
     )
-    (tmp_path / "brake_power.py").write_text((EXAMPLES / "brake_power.py").read_text())
+    (tmp_path / "brake_power.py").write_text((EXAMPLES / "brake_power.py").read_text("utf-8"))
     return tmp_path
 
 
@@ -151,7 +151,7 @@ def test_a_limit_of_ones_own_stops_a_run_as_the_docs_say(run, folder):
         folder / "rig.yaml", limits={"own": [{"use": "brake_power.py:BrakePower",
                                               "options": {"most": "500 mW", "over": "0.1 s"}}]}
     )  # fmt: skip
-    (folder / "pull.yaml").write_text((folder / "steady.yaml").read_text() + "volts: 1.0\n")
+    (folder / "pull.yaml").write_text((folder / "steady.yaml").read_text("utf-8") + "volts: 1.0\n")
     result = run(["run", "pull.yaml", "--rig", "rig.yaml"], folder)
     assert result.returncode == 1, result.stdout
     assert "the brake takes 0.5" in result.stderr and "its limit of 0.5 W" in result.stderr

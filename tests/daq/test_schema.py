@@ -43,7 +43,7 @@ OF_A_MODEL = re.compile(
 
 def schema_of(path):
     """The schema that a YAML's first line names, as the editor resolves it."""
-    found = re.match(r"# yaml-language-server: \$schema=(\S+)\n", path.read_text())
+    found = re.match(r"# yaml-language-server: \$schema=(\S+)\n", path.read_text("utf-8"))
     assert found, f"{path}: its first line names no schema"
     return (path.parent / found[1]).resolve()
 
@@ -70,7 +70,7 @@ def is_number(schema):
 
 @pytest.mark.parametrize("kind", DOCUMENTS)
 def test_the_shipped_schema_is_up_to_date_and_a_schema(kind):
-    shipped = json.loads((ROOT / "daq" / "schemas" / f"{kind}.json").read_text())
+    shipped = json.loads((ROOT / "daq" / "schemas" / f"{kind}.json").read_text("utf-8"))
     assert shipped == DOCUMENTS[kind], REGENERATE
     jsonschema.Draft7Validator.check_schema(shipped)
 
@@ -82,13 +82,13 @@ def test_the_reference_pages_are_up_to_date():
     made = {path.name for path in folder.glob("protocol-*.md")}
     assert made == {name for name in pages if name.startswith("protocol-")}, REGENERATE
     for name, text in pages.items():
-        assert (folder / name).read_text() == text, REGENERATE
+        assert (folder / name).read_text("utf-8") == text, REGENERATE
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
 def test_every_shipped_yaml_names_its_schema_and_agrees_with_it(path):
-    schema = json.loads(schema_of(path).read_text())
-    jsonschema.Draft7Validator(schema).validate(yaml.safe_load(path.read_text()))
+    schema = json.loads(schema_of(path).read_text("utf-8"))
+    jsonschema.Draft7Validator(schema).validate(yaml.safe_load(path.read_text("utf-8")))
 
 
 @pytest.mark.parametrize("kind", DOCUMENTS)
@@ -137,8 +137,8 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("path", "key", "value"), MISTAKES)
 def test_the_schema_refuses_the_mistakes_that_the_program_refuses(path, key, value):
-    good = yaml.safe_load(path.read_text())
-    checker = jsonschema.Draft7Validator(json.loads(schema_of(path).read_text()))
+    good = yaml.safe_load(path.read_text("utf-8"))
+    checker = jsonschema.Draft7Validator(json.loads(schema_of(path).read_text("utf-8")))
     assert checker.is_valid(good)
     wrong = copy.deepcopy(good)
     section = wrong
@@ -153,7 +153,7 @@ def test_the_schema_refuses_the_mistakes_that_the_program_refuses(path, key, val
 
 @pytest.mark.parametrize("value", ["5 ms", "0.005 s", "5e-3 s", 0.005])
 def test_the_schema_takes_quantities(value):
-    content = yaml.safe_load(EXPERIMENT.read_text())
+    content = yaml.safe_load(EXPERIMENT.read_text("utf-8"))
     content["motor"]["minimum_period"] = value
     jsonschema.Draft7Validator(DOCUMENTS["experiment"]).validate(content)
 

@@ -57,7 +57,7 @@ def parameters(result):
 
 
 def test_a_result_is_kept_with_its_covariance(stages):
-    first = yaml.safe_load((stages / "first/parameters.yaml").read_text())
+    first = yaml.safe_load((stages / "first/parameters.yaml").read_text("utf-8"))
     tau = first["parameters"]["tau"]["value"]
     kept = parameters(identify(stages, "second", "--given", "first", "--set", "ranges.gain=[1,9]"))
     merely = parameters(identify(stages, "second", "--set", f"fixed.tau={tau}", "--out", "fixed"))
@@ -76,7 +76,7 @@ def test_the_file_is_named_in_the_configuration_too_and_units_are_heeded(stages)
     settings = {**SETTINGS, "model": "../models.py:coarse", "given": "../first/parameters.yaml"}
     (stages / "in/id.yaml").write_text(yaml.safe_dump({**settings, "ranges": {"gain": [1, 9]}}))
     result = identify(stages, "second", "--set", "generations=1", config="in/id.yaml")
-    first = yaml.safe_load((stages / "first/parameters.yaml").read_text())
+    first = yaml.safe_load((stages / "first/parameters.yaml").read_text("utf-8"))
     # A model that counts in another unit would need other equations; the number is what is tried.
     assert parameters(result)["tau"]["value"] == pytest.approx(
         1e3 * first["parameters"]["tau"]["value"]
@@ -90,7 +90,7 @@ def test_what_the_settings_say_goes_before(stages):
 
 
 def changed(stages, name, change):
-    content = yaml.safe_load((stages / "first/parameters.yaml").read_text())
+    content = yaml.safe_load((stages / "first/parameters.yaml").read_text("utf-8"))
     change(content)
     (stages / name).write_text(yaml.safe_dump(content, sort_keys=False))
     return name

@@ -69,7 +69,7 @@ def test_a_design_says_how_surely_it_tells_them_apart(tmp_path):
     done = rig("design", "question.yaml", "--out", "d", "--json", cwd=tmp_path, timeout=300)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
-    assert json.loads((tmp_path / "d" / "design.json").read_text()) == document
+    assert json.loads((tmp_path / "d" / "design.json").read_text("utf-8")) == document
     assert (tmp_path / "d" / "design.png").stat().st_size > 10_000
     pairs = {(pair["truth"], pair["rival"]): pair for pair in document["pairs"]}
     assert pairs.keys() == {

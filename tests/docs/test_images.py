@@ -11,5 +11,5 @@ def test_every_picture_has_a_recipe_and_a_page():
     pictures = {path.name for path in [*IMAGES.iterdir(), *GALLERY.glob("*.png")]}
     assert pictures == set(PICTURES)
     pages = [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")]
-    text = "".join(page.read_text() for page in pages)
+    text = "".join(page.read_text("utf-8") for page in pages)
     assert [name for name in pictures if f"{name})" not in text] == []

@@ -38,7 +38,7 @@ def test_it_runs_and_its_rows_are_latched_before_they_are_applied(lab):
     applied, current = log["applied_voltage_motor"], log["current_motor"] / per_volt
     predicted = keep * current + (1.0 - keep) * applied
     np.testing.assert_allclose(current[1:], predicted[:-1], atol=1e-12)
-    assert json.loads((only_capture(lab) / "run.json").read_text())["device"] == "my board"
+    assert json.loads((only_capture(lab) / "run.json").read_text("utf-8"))["device"] == "my board"
 
 
 def test_it_passes_what_every_backend_passes(lab):
@@ -64,7 +64,7 @@ def test_it_passes_what_every_backend_passes(lab):
 )
 def test_a_mistake_in_naming_it_is_answered(lab, old, new, message):
     path = lab / "my_rig.yaml"
-    path.write_text(path.read_text().replace(old, new))
+    path.write_text(path.read_text("utf-8").replace(old, new))
     result = rig("check", "e.yaml", "--rig", "my_rig.yaml", cwd=lab)
     assert result.returncode == 2
     assert message in result.stderr

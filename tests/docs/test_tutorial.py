@@ -54,7 +54,7 @@ def test_every_command_works_as_it_stands(tmp_path):
             identifies = bool({"identify", "--identify"} & set(words))
             if identifies:
                 settings = folder / "identification.yaml"
-                content = yaml.safe_load(settings.read_text()) | few_free()
+                content = yaml.safe_load(settings.read_text("utf-8")) | few_free()
                 settings.write_text(yaml.safe_dump(content))
                 words += [] if "--config" in words else ["--config", "identification.yaml"]
             result = rig(*words, cwd=folder, timeout=600, report=not identified)

@@ -124,7 +124,7 @@ def test_without_a_fault_every_protocol_is_completed(tmp_path, name, seed):
     result = run_experiment(experiment, "e", session.rig, device, tmp_path / "runs")
     assert not currents.notes(result.folder / "log.csv", session.rig)
     assert record_of(result.folder)["status"] == "completed"
-    truth = json.loads((tmp_path / "truth.json").read_text())
+    truth = json.loads((tmp_path / "truth.json").read_text("utf-8"))
     assert truth["onset"] is None and truth["output"] == [0.0, 0.0]
     assert 0.0 < truth["omega"] < 150.0 and 0.0 < truth["current_motor"] < 2.4
 

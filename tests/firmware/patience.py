@@ -58,11 +58,11 @@ def _seconds_of_others():
     """Seconds of processors that neither this process nor those behind it have had."""
     if not Path("/proc/stat").exists():
         return 0.0
-    user, nice, system, _, _, *rest = map(int, Path("/proc/stat").read_text().split()[1:9])
+    user, nice, system, _, _, *rest = map(int, Path("/proc/stat").read_text("utf-8").split()[1:9])
     times, parents = {}, {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
-            fields = path.read_text().rpartition(")")[2].split()
+            fields = path.read_text("utf-8").rpartition(")")[2].split()
         except OSError:
             continue  # it has just ended
         pid = int(path.parent.name)

@@ -34,7 +34,7 @@ def test_it_has_no_heap_and_the_stack_that_it_needs(elf):
     assert "rig_on_tick" in names
     assert not names & {"malloc", "free", "calloc", "_sbrk", "_malloc_r", "printf", "__aeabi_dadd"}
     # Every function of ours in one call after the other is more than any path through them.
-    usage = [path.read_text() for path in elf.parent.glob("*.su")]
+    usage = [path.read_text("utf-8") for path in elf.parent.glob("*.su")]
     rows = re.findall(r"\t(\d+)\t(\w+)", "\n".join(usage))
     assert rows and all(kind == "static" for _, kind in rows)
     assert sum(int(size) for size, _ in rows) < 2048

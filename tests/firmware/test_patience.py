@@ -29,7 +29,7 @@ from pathlib import Path
 @pytest.mark.patient
 def test_something():
     tries = Path("tries")
-    n = len(tries.read_text()) if tries.exists() else 0
+    n = len(tries.read_text("utf-8")) if tries.exists() else 0
     tries.write_text("x" * (n + 1))
     if {varied} and n % 2:
         assert not "here now and then"
@@ -58,7 +58,7 @@ def test_only_what_fails_on_load_is_tried_again(tmp_path, load, good, varied, wo
         words, cwd=tmp_path, env=alone, capture_output=True, text=True, check=False
     )
     assert outcome in done.stdout, done.stdout + done.stderr
-    assert len((tmp_path / "tries").read_text()) == tries
+    assert len((tmp_path / "tries").read_text("utf-8")) == tries
     skipped = "too busy a machine for real time: a busy core"
     assert (skipped in done.stdout) == (outcome == "1 skipped")
 

@@ -200,7 +200,7 @@ def identified(folder):
     done = rig(*words, cwd=folder, timeout=600)
     assert done.returncode == 0, done.stderr
     (file,) = folder.glob("**/parameters.yaml")
-    rows = yaml.safe_load(file.read_text())["parameters"]
+    rows = yaml.safe_load(file.read_text("utf-8"))["parameters"]
     intervals = {name: row.get("interval") for name, row in rows.items()}
     return {name: ends for name, ends in intervals.items() if ends and None not in ends}
 
@@ -243,7 +243,9 @@ def rehearsal(elf, tmp_path):
     process = start_rig("emulate", "--firmware", elf, cwd=tmp_path, start_new_session=True)
     try:
         assert process.stdout.readline().startswith("/dev/pts/"), process.communicate()[1]
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        children = (
+            Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text("utf-8").split()
+        )
         yield process, int(children[0])
     finally:
         process.kill()

@@ -40,7 +40,7 @@ LIGHT = {"K_u": 0.08, "B_u": 0.009}  # half a hand
 
 
 def walls(folder, path, **changes):
-    content = yaml.safe_load((SHIPPED / "virtual_wall.yaml").read_text())
+    content = yaml.safe_load((SHIPPED / "virtual_wall.yaml").read_text("utf-8"))
     file = folder / "walls.yaml"
     file.write_text(yaml.safe_dump({**content, "torque_controller": str(path), **changes}))
     return file
@@ -141,7 +141,7 @@ def test_rig_check_tells_trials_and_refuses_what_trips(static):
     told = json.loads(done.stdout)["trials"]
     assert told["trials"] == 50 and told["tripped"] == 0 and told["disk_margin"] == pytest.approx(2)
     assert "No uncertainty" in told["remarks"][0]
-    slow = yaml.safe_load((Path(sim_rig.__file__).parent / "moving_hand.yaml").read_text())
+    slow = yaml.safe_load((Path(sim_rig.__file__).parent / "moving_hand.yaml").read_text("utf-8"))
     slow["limits"]["speed"] = 5.0
     (folder / "slow.yaml").write_text(yaml.safe_dump(slow))
     refused = rig("check", file.name, "--draws", "50", "--rig", "slow.yaml", cwd=folder)
@@ -154,7 +154,7 @@ def test_rig_check_tells_trials_and_refuses_what_trips(static):
 
 def test_a_spread_of_the_parameters_is_in_the_trials(static):
     folder, path, _ = static
-    content = yaml.safe_load((folder / path).read_text())
+    content = yaml.safe_load((folder / path).read_text("utf-8"))
     content["covariance"] = {"parameters": ["K_m", "J_m"], "factor": [[0.01, 0.0], [0.0, 1e-5]]}
     (folder / "spread.yaml").write_text(yaml.safe_dump(content))
     tuned = load_controller("spread.yaml", folder)
@@ -212,7 +212,7 @@ def test_limits_are_those_of_the_rig():
 def test_no_promised_wall_rings_on_hundreds_of_plausible_actuators(static):
     """A wall just below the promise, in hands from 1/4 to 4 times that of (A.2)."""
     folder, path, _ = static
-    content = yaml.safe_load((folder / path).read_text())
+    content = yaml.safe_load((folder / path).read_text("utf-8"))
     names = ["K_m", "J_m", "B_m", "alpha0", "c0", "R_m"]
     spread = np.diag([0.05 * content["parameters"][name] for name in names])
     content["covariance"] = {"parameters": names, "factor": spread.tolist()}

@@ -68,7 +68,7 @@ class Aboard(SimulatedDevice):
 
 
 def experiment(protocol, **changes):
-    content = yaml.safe_load((SHIPPED / f"{protocol}.yaml").read_text())
+    content = yaml.safe_load((SHIPPED / f"{protocol}.yaml").read_text("utf-8"))
     content |= {"on_device": True, "calibration": {"samples": 400}, "protocol": protocol, **changes}
     return find_class("protocol", protocol, SHIPPED)(**content)
 
@@ -145,7 +145,7 @@ def test_an_order_that_comes_too_late_ends_the_run_with_what_was_logged(tmp_path
     with pytest.raises(DeviceError, match=r"refuses LAW: .* for this computer was held up"):
         run(tmp_path, "transparency", device, block=1.2, pairs=2, torque_controller=CONTROLLER)
     assert device.orders == [(960, 80, True)] and device.zeroed > 0
-    (record,) = (json.loads(path.read_text()) for path in tmp_path.glob("*/run.json"))
+    (record,) = (json.loads(path.read_text("utf-8")) for path in tmp_path.glob("*/run.json"))
     (log,) = (pd.read_csv(path) for path in tmp_path.glob("*/log.csv"))
     assert record["status"] == "failed" and "refuses LAW" in record["reason"]
     assert 960 < len(log) < 1920, "it is refused ahead of its tick, while the law still answers"

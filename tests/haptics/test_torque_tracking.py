@@ -20,7 +20,7 @@ def controller(folder, kind, **settings):
 
 
 def experiment(folder, path, **changes):
-    content = yaml.safe_load((SHIPPED / "torque_tracking.yaml").read_text())
+    content = yaml.safe_load((SHIPPED / "torque_tracking.yaml").read_text("utf-8"))
     content |= {"torque_controller": str(path), "duration": 2.0, "calibration": {"samples": 400}}
     file = folder / "e.yaml"
     file.write_text(yaml.safe_dump({**content, **changes}))
@@ -73,7 +73,7 @@ def test_a_run_of_the_command_logs_reference_and_torque(tmp_path):
     done = rig("run", path.name, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (log,) = tmp_path.glob("runs/*/log.csv")
-    assert log.read_text().partition("\n")[0].endswith("torque_ref")
+    assert log.read_text("utf-8").partition("\n")[0].endswith("torque_ref")
 
 
 def test_a_sensor_that_is_listened_to_is_said_to_be_no_judge(tmp_path):

@@ -13,7 +13,7 @@ TO_AND_FRO = [[0.3 + 0.3 * k, 0.6 * (-1) ** k] for k in range(16)]
 
 
 def experiment(folder, path, **changes):
-    content = yaml.safe_load((SHIPPED / "transparency.yaml").read_text())
+    content = yaml.safe_load((SHIPPED / "transparency.yaml").read_text("utf-8"))
     content |= {"torque_controller": str(path), "block": 1.2, "calibration": {"samples": 400}}
     file = folder / "e.yaml"
     file.write_text(yaml.safe_dump({**content, **changes}))

@@ -124,7 +124,7 @@ def test_the_command_writes_what_it_shows(tmp_path):
     done = rig("tune", "torque.yaml", "--parameters", "parameters.yaml", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
-    written = yaml.safe_load((tmp_path / "controller.yaml").read_text())
+    written = yaml.safe_load((tmp_path / "controller.yaml").read_text("utf-8"))
     assert document.pop("file") == "controller.yaml"
     assert document == written
     assert written["settings"]["controller"] == "feedforward"
@@ -165,7 +165,7 @@ def test_a_model_that_is_no_actuator_is_refused(tmp_path):
 def test_the_shipped_controller_is_what_tune_makes_for_the_simulated_rig():
     made = tune("torque.yaml", model="actuator:parameters=rig").document
     path = Path(haptics.__file__).parent / "simulated_controller.yaml"
-    shipped = yaml.safe_load(path.read_text())
+    shipped = yaml.safe_load(path.read_text("utf-8"))
     for document in (made, shipped):
         document.pop("software")
     again = "run: rig tune torque.yaml --model actuator:parameters=rig --out haptics/simulated_..."

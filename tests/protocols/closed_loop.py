@@ -16,7 +16,7 @@ SHIPPED = Path(protocols.__file__).parent
 
 def shipped(name, kind, **changes):
     """The experiment of a shipped file, with changes."""
-    return kind.model_validate(merged(yaml.safe_load((SHIPPED / name).read_text()), changes))
+    return kind.model_validate(merged(yaml.safe_load((SHIPPED / name).read_text("utf-8")), changes))
 
 
 def run(experiment, folder, plant, rig=None, **options):

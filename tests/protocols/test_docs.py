@@ -13,8 +13,8 @@ from daq.lookup.experiments import load_experiment
 from daq.plugins import installed
 
 DOCS = Path(protocols.__file__).parents[1] / "docs" / "protocols"
-TEXT = (DOCS / "README.md").read_text()
-OWN = (DOCS.parent / "own-protocol.md").read_text()
+TEXT = (DOCS / "README.md").read_text("utf-8")
+OWN = (DOCS.parent / "own-protocol.md").read_text("utf-8")
 BLOCK = r"```\w+\n(.*?)```"
 
 
@@ -35,7 +35,7 @@ def test_examples_of_own_protocols_run_as_written(tmp_path, command):
         assert "Traceback" not in result.stderr
     assert (tmp_path / "square.png").exists() and (tmp_path / "angle_step.png").exists()
     (folder,) = (tmp_path / "runs").glob("*-angle_step")
-    found = yaml.safe_load((folder / "results" / "findings.json").read_text())["numbers"]
+    found = yaml.safe_load((folder / "results" / "findings.json").read_text("utf-8"))["numbers"]
     assert abs(found["rest_error"]["value"]) < 0.1, "the shaft went where it was sent"
     assert 0.005 < found["rise_time"]["value"] < 1.0
 
@@ -49,6 +49,6 @@ def test_every_protocol_has_its_file_its_page_and_a_line_in_the_index(name):
 
 @pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda path: path.name)
 def test_pages_name_files_that_are_there(page):
-    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text("utf-8")):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), target

@@ -101,7 +101,7 @@ class Workshop:
         child = context.Process(target=_run_as_script, args=(self.folder, self.env | env))
         child.start()
         child.join(120)
-        out, err = ((self.folder / name).read_text() for name in ("out", "err"))
+        out, err = ((self.folder / name).read_text("utf-8") for name in ("out", "err"))
         return child.exitcode, out, err
 
     def run(self, **env: str) -> float:
@@ -122,7 +122,7 @@ class Workshop:
 
     def edit(self, name: str, old: str, new: str) -> None:
         path = self.folder / name
-        text = path.read_text()
+        text = path.read_text("utf-8")
         assert old in text
         path.write_text(text.replace(old, new))
 

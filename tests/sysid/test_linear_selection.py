@@ -174,7 +174,7 @@ def test_tuning_holds_the_ends_back_and_then_fits_the_whole():
 
 
 def test_the_example_of_the_documentation_runs(capsys):
-    text = (Path(__file__).parents[2] / "docs" / "armax.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "armax.md").read_text("utf-8")
     names = {}
     exec(re.search(r"```python\n(.*?)```", text, re.DOTALL).group(1), names)
     assert names["found"].best.score > 0.7

@@ -362,7 +362,7 @@ def rig_file(path, backend="quanser", **changes):
 
 
 def without_seed(path):
-    text = path.read_text()
+    text = path.read_text("utf-8")
     path.write_text("\n".join(line for line in text.splitlines() if "seed:" not in line))
     return path
 
@@ -477,7 +477,7 @@ def test_a_first_evening_begins_with_the_doctor(tmp_path, backend):
     result = rig("init", "lab", "--rig", backend, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "1. rig doctor --rig rig.yaml" in result.stdout and "rig ports" not in result.stdout
-    text = (tmp_path / "lab/rig.yaml").read_text()
+    text = (tmp_path / "lab/rig.yaml").read_text("utf-8")
     assert "  # phase: 0" in text and "motor: [-0.5, 0.5]" in text
 
 
@@ -492,7 +492,7 @@ def test_the_shipped_experiment_is_identified_on_a_fake_card(tmp_path, backend):
     assert text.returncode == 0, text.stderr
     from daq.lookup.shipped import shipped_files
 
-    shipped = shipped_files("backend")[f"{backend}.yaml"].read_text()
+    shipped = shipped_files("backend")[f"{backend}.yaml"].read_text("utf-8")
     measured = shipped.replace("  # phase: 0", "  phase: 0").replace("watchdog: 0.1", "watchdog: 1")
     (tmp_path / "rig.yaml").write_text(measured)
     write_yaml(tmp_path / "id.yaml", {"model": "actuator", "seed": 1})

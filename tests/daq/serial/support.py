@@ -111,7 +111,7 @@ def forked_emulators():
         try:
             said = until(lambda: _whole_json(out, err), "the emulator's port")
             yield Emulated(pid, said["port"], journal)
-            assert _alive(pid), "the emulator ended by itself: " + err.read_text()
+            assert _alive(pid), "the emulator ended by itself: " + err.read_text("utf-8")
         finally:
             if _alive(pid):
                 os.kill(pid, signal.SIGTERM)
@@ -122,10 +122,10 @@ def forked_emulators():
 
 
 def _whole_json(out: Path, err: Path):
-    text = out.read_text() if out.exists() else ""
+    text = out.read_text("utf-8") if out.exists() else ""
     if "}" in text:
         return json.loads(text)
-    errors = err.read_text() if err.exists() else ""
+    errors = err.read_text("utf-8") if err.exists() else ""
     assert "Traceback" not in errors and "rig: " not in errors, errors
     return None
 

@@ -153,7 +153,7 @@ def test_an_emulator_that_cannot_be_is_refused_before_it_starts(tmp_path, run, w
     (tmp_path / "taken.txt").write_text("mine")
     result = run(["emulate", *words], tmp_path)
     assert result.returncode == 2 and said in result.stderr, result.stderr
-    assert (tmp_path / "taken.txt").read_text() == "mine"
+    assert (tmp_path / "taken.txt").read_text("utf-8") == "mine"
 
 
 def test_the_faults_are_listed(tmp_path):

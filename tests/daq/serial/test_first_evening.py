@@ -53,7 +53,7 @@ def evening(lab, run, **changes):
 
 
 def replace_in(file, old, new):
-    text = file.read_text()
+    text = file.read_text("utf-8")
     assert old in text
     file.write_text(text.replace(old, new))
 
@@ -109,7 +109,7 @@ def test_zero_commands_are_not_offered_for_an_identification(tmp_path, run):
     at_rest = run(["run", "still.yaml", "--rig", "simulated.yaml"], tmp_path).stdout
     assert "rig identify" not in at_rest
     assert at_rest.endswith("Next: rig run tenth.yaml --rig simulated.yaml\n")
-    record = json.loads(next(tmp_path.glob("runs/*-still/run.json")).read_text())
+    record = json.loads(next(tmp_path.glob("runs/*-still/run.json")).read_text("utf-8"))
     offset = 1e3 * record["offsets"]["current_motor"]
     shown = re.search(r"current_motor +(\S+) mA", at_rest)[1]
     assert float(shown) == pytest.approx(offset, rel=5e-3)
@@ -117,7 +117,7 @@ def test_zero_commands_are_not_offered_for_an_identification(tmp_path, run):
 
 
 def limits_of(name):
-    return yaml.safe_load(shipped_files("backend")[name].read_text())["limits"]
+    return yaml.safe_load(shipped_files("backend")[name].read_text("utf-8"))["limits"]
 
 
 def test_the_first_limits_are_a_tenth_of_the_full_ones():
@@ -166,7 +166,7 @@ def test_no_first_limit_trips_by_an_honest_sensors_noise(tmp_path, run, seed):
     ids=["motor", "brake"],
 )
 def test_a_tenth_is_enough_to_find_a_sensor_turned_round(tmp_path, run, channel, message):
-    content = yaml.safe_load(shipped_files("backend")["serial_tenth.yaml"].read_text())
+    content = yaml.safe_load(shipped_files("backend")["serial_tenth.yaml"].read_text("utf-8"))
     content |= {"backend": "simulated", "options": {}}
     content["sensors"][f"current_{channel}"]["sign"] = -1
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(content))
