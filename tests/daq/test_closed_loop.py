@@ -136,9 +136,7 @@ def test_what_the_protocol_concludes_is_written_and_shown(run, tmp_path):
     table = pd.read_csv(results / "angle.csv")
     np.testing.assert_array_equal(table["theta"], log["theta"])
     assert (results / "angle.png").stat().st_size > 1000
-    assert yaml.safe_load((results / "ranges.yaml").read_text())["ranges"] == {
-        "K_m": [0.1, 0.2]
-    }
+    assert yaml.safe_load((results / "ranges.yaml").read_text())["ranges"] == {"K_m": [0.1, 0.2]}
     folder = only_capture(tmp_path).relative_to(tmp_path)
     again = rig("analyse", folder, "--trust", "--json", cwd=tmp_path)
     assert again.returncode == 0, again.stderr

@@ -171,9 +171,7 @@ def test_a_long_log_is_searched_by_parts_and_that_is_told(folder):
     values = result.parameters["value"]
     assert values["gain"] == pytest.approx(GAIN, rel=0.01)
     assert values["tau"] == pytest.approx(TAU, rel=0.01)
-    excerpt = yaml.safe_load((folder / "out" / "parameters.yaml").read_text())["search"][
-        "excerpt"
-    ]
+    excerpt = yaml.safe_load((folder / "out" / "parameters.yaml").read_text())["search"]["excerpt"]
     assert (excerpt["samples"], excerpt["of"]) == (2048, 8000)
     assert excerpt["parts"][0] == {"log": str(folder / "long.csv"), "rows": [1, 1024]}
 
