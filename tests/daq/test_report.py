@@ -211,7 +211,7 @@ def test_without_validation_the_residuals_are_those_of_the_training(command, fol
 def test_json_is_what_the_file_holds(identify, folder, told):
     document = json.loads(identify("--out", "json", "--json"))
     kept = yaml.safe_load((folder / "json" / "parameters.yaml").read_text("utf-8"))
-    assert document.pop("files") == {"parameters": "json/parameters.yaml"}
+    assert document.pop("files") == {"parameters": str(Path("json/parameters.yaml"))}
     assert document == json.loads(json.dumps(kept))
     # And one seed gives one report.
     before = json.loads(json.dumps(told[1]))
