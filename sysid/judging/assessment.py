@@ -140,7 +140,7 @@ def examine(
     systematic = None if expected is None else expected.systematic
     evened = residual if expected is None else expected.evened(residual)
     shared = by_speed = None
-    alone = errors_alone(evened) if finite else None
+    alone = errors_alone(evened, record.outputs) if finite else None
     if alone is not None and record.jitter.size:
         alone[record.jitter.any(axis=0)] = 0.0  # each has a variance of its own
     if systematic is not None and finite:

@@ -11,7 +11,7 @@ from scipy.special import bdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.residual_tests import residual_test
-from sysid.problem.channels import MEDIAN_OF_NORMAL
+from sysid.problem.channels import MEDIAN_OF_NORMAL, resolution
 from sysid.uncertainty.estimate import Z95
 
 _LAGS = 20  # at which two outputs' residuals are compared
@@ -65,16 +65,17 @@ def errors_by_speed(
     return trend
 
 
-def errors_alone(residual: FloatArray) -> FloatArray:
+def errors_alone(residual: FloatArray, outputs: FloatArray) -> FloatArray:
     """Share of each output's errors that stand alone, (n_outputs,), 0 where chance explains it.
 
-    residual: (n, n_outputs), NaN where a sample was lost. One stands alone where it is six robust
-    deviations from the mean of its neighbours, and the farthest of the three.
+    residual, outputs: (n, n_outputs), NaN where a sample was lost. One stands alone where it is six
+    robust deviations, and more than an output's resolution, from the mean of its neighbours, and
+    the farthest of the three.
 
     >>> rng = np.random.default_rng(0)
     >>> noise = rng.standard_normal((500, 2))
     >>> noise[10::25, 1] += 12.0
-    >>> errors_alone(noise).round(2).tolist()
+    >>> errors_alone(noise, 100.0 + noise).round(2).tolist()
     [0.0, 0.04]
     """
     n, share = len(residual), np.zeros(residual.shape[1])
@@ -84,6 +85,8 @@ def errors_alone(residual: FloatArray) -> FloatArray:
     for j in np.flatnonzero(sizes.any(axis=0)):
         size = sizes[:, j]
         limit = _ALONE / MEDIAN_OF_NORMAL * float(np.median(size[size > 0.0]))
+        # What moves slowly is rounded up by a whole step at once.
+        limit = max(limit, resolution(outputs[:, j]))
         beside = np.maximum(np.roll(size, 1), np.roll(size, -1))
         count = int(np.sum((size > limit) & (size > beside)))
         if bdtrc(count - 1, n, _HEAVY) < _BY_CHANCE:

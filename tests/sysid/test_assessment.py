@@ -576,6 +576,20 @@ def test_errors_far_from_their_neighbours_are_outliers(outliers):
         assert " % of what is left of speed stands alone, far from what is left" in reason
 
 
+@pytest.mark.parametrize("step", [0.2, 0.02])
+def test_a_sensor_that_rounds_what_moves_slowly_has_no_outliers(step):
+    """At rest it errs by the same again and again, and then by a step at once."""
+
+    def rounded(seed):
+        data = record(seed)
+        levels = np.repeat(np.random.default_rng([seed, 7]).uniform(-1.0, 1.0, (N // 40, 2)), 40, 0)
+        slow = lfilter([0.1], [1.0, -0.9], levels, axis=0)
+        shown = replace(data, outputs=step * np.round(slow / step))
+        return examine(shown, slow)
+
+    assert not any(np.any(rounded(seed).alone) for seed in range(5))
+
+
 def test_parts_of_a_log_that_want_their_own_parameters_make_them_doubtful():
     apart = replace(told(""), disagreement=9.0)
     (reason,) = verdict(uncertainty=apart).parameters.reasons
