@@ -37,6 +37,7 @@ _AWAY = 0.5  # deviations between an estimate and the minimum that slopes forete
 _SAMPLED = 40  # points of a range at which it is tried whether simulations fail
 _DRAWS = 20_000  # of all quantities together
 _ALIKE = 0.05  # rivals closer than this are one
+_AT_VALUE = 0.01  # of a width of an interval, from its end: its value stands there
 _NOT_BY_CHANCE = 3.3  # deviations: one in a thousand
 _SIDES = (-1.0, 1.0)
 _ROUNDS = 3  # of searches that go on from what others came to
@@ -246,6 +247,14 @@ def uncertainty(
     joint, simultaneous = analysis.together(intervals)
     moved = analysis.moved_by_bends(intervals) if np.any(result.bent > MISJUDGED) else 0.0
     return replace(result, joint=joint, simultaneous=simultaneous, moved_by_bends=moved)
+
+
+def _ends_at_value(estimate: Estimate) -> bool:
+    """Whether a traced interval of two ends has its value at one of them."""
+    if estimate.std is not None or estimate.low is None or estimate.high is None:
+        return False
+    beside = min(estimate.high - estimate.value, estimate.value - estimate.low)
+    return beside < _AT_VALUE * (estimate.high - estimate.low)
 
 
 def _told_apart(minima: Sequence[Rival], disputed: Sequence[Estimate]) -> tuple[Rival, ...]:
@@ -617,9 +626,13 @@ class _Analysis:
         """Parameters, (n_free,), on an end of their range that decides nothing.
 
         Nor do all such ends together. By chance data may push a friction that is next to nothing
-        below nothing. places: of those for which that is asked, default all.
+        below nothing. Where an interval ends at its value it is an end of a range that ends it.
+        places: of those for which that is asked, default all.
         """
         candidates = self.on_bound & ~self._pushed_by(_NOT_BY_CHANCE)
+        bound = set(itertools.compress(self.space.names, self.on_bound.tolist()))
+        if any(_ends_at_value(e) for e in estimates if not e.is_of(bound)):
+            return np.zeros(len(candidates), dtype=bool)
         if places is not None:
             candidates &= np.isin(np.arange(len(candidates)), places)
         harmless = np.zeros(len(candidates), dtype=bool)

@@ -932,6 +932,20 @@ def test_an_end_near_nothing_is_harmless_where_data_push_beyond_it_by_chance(lac
     assert told["b"].harmless is harmless
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_end_at_which_the_interval_of_another_ends_is_not_harmless(seed):
+    """Of b next to nothing is known, so that a is what the range of b lets it be."""
+
+    def formula(p, u):
+        return columns((p["a"] + p["b"]) * u[:, 0] + 0.003 * p["b"] * u[:, 1])
+
+    problem = Problem(formula, [unknown("a", 3.0), unknown("b", 0.5)], seed=seed)
+    ended = estimates(problem.tell(ranges={"b": (1.0, 2.0)}))
+    a, b = ended["a"], ended["b"]
+    assert a.high < 3.0, "an interval that excludes the truth"
+    assert b.on_bound and not b.harmless
+
+
 def test_ends_that_decide_something_together_are_not_harmless():
     """A tenfold of b or of c is nothing, of both a hundredfold, by which a is another."""
 
