@@ -203,7 +203,7 @@ def print_table(
     columns = [[name, *_lines(row[index] for row in rows)] for index, name in enumerate(head)]
     whole = [max(map(len, column)) for column in columns]
     narrow = sum(whole) + 3 * len(head) > console.width
-    room = console.width - 2 * (len(head) - 1)
+    room = console.width - 2 * (len(head) - 1) - 1
     widths = _narrowed(columns, words, room) if narrow else whole
     table = Table(
         header_style="bold", pad_edge=False, padding=(0, 1, 0, 0) if narrow else (0, 1),
@@ -297,10 +297,10 @@ def _narrowed(columns: Sequence[Sequence[str]], words: Sequence[bool], room: int
             widths.append(max(map(len, [*parts, *_parts(cells[0], heads)]), default=0))
         if sum(widths) <= room:
             break
-    # What is left goes to text first, which is wrapped in every row.
-    for index in sorted(range(len(columns)), key=lambda i: not words[i]):
-        spare = max(room - sum(widths), 0)
-        widths[index] += min(spare, max(map(len, columns[index])) - widths[index])
+    # What is left goes to text first, which is wrapped in every row, the least lacking before.
+    lacking = [max(map(len, cells)) - width for cells, width in zip(columns, widths, strict=True)]
+    for index in sorted(range(len(columns)), key=lambda i: (not words[i], lacking[i])):
+        widths[index] += min(max(room - sum(widths), 0), lacking[index])
     return widths
 
 

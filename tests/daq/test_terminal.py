@@ -220,6 +220,27 @@ def test_what_ended_early_is_full_when_the_next_begins_and_its_clock_stands(tmp_
     assert full in meanwhile and "generation 6/40" in meanwhile
 
 
+FULL = """
+from daq.cli.terminal import print_table
+print_table("Parameters", ["parameter", "value", "95 % interval", "unit", "searched in"],
+            [["mass", "0.119996", "0.119985 .. 0.120007", "kg", "0.01 .. 1"],
+             ["damping", "1.40003", "1.39991 .. 1.40014", "N*s/m", "0.1 .. 10"],
+             ["cube_of_position_in_velocity", "-154.34", "-154.39 .. -154.28", "m/s^2",
+              "-1000 .. 1000"]], text=["unit"])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
+@pytest.mark.parametrize("columns", range(74, 95, 5))
+def test_a_table_that_fills_a_terminal_is_no_wider_and_breaks_no_unit(tmp_path, columns):
+    shown = on_terminal(["-c", FULL], tmp_path, columns=columns, program=[sys.executable])
+    lines = [line.rstrip() for line in shown.splitlines()]
+    assert max(map(len, lines)) <= columns
+    assert not any(line == "─" for line in lines)
+    for cell in ("0.119985 .. 0.120007", "-1000 .. 1000", "N*s/m", "m/s^2"):
+        assert any(cell in line for line in lines)
+
+
 def test_a_note_is_shown_once_however_often_it_is_given(capsys):
     with watching(quiet=True) as watch:
         for text in ("no cable", "no cable", "no hand", "no cable"):
