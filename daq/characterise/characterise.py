@@ -18,7 +18,7 @@ from daq.characterise.rounds import Interval, Request, Round, rounds_of
 from daq.config import yaml_file
 from daq.config.yaml_file import TypedSettings
 from daq.designs.design import choose, write
-from daq.designs.runs import DATA
+from daq.designs.files import DATA
 from daq.designs.setup import Setup, set_up
 from daq.errors import ConfigError, InterlockError, RigError, Terminated
 from daq.files import make_folder

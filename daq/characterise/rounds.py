@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.config import json_file, yaml_file
-from daq.designs.runs import DATA
+from daq.designs.files import DATA
 from daq.errors import ConfigError
 from daq.files import make_folder, write_whole
 from daq.identification.earlier_fit import EarlierFit

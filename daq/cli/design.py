@@ -147,7 +147,9 @@ def _show_runs(runs: Sequence[PlannedRun], rig: str, seconds: float) -> None:
 
 
 def _show_next(result: DesignResult | DiscriminationResult) -> None:
-    files = f"Experiments, {result.figure.name}, design.json and commands.txt"
+    from daq.designs.files import COMMANDS, DATA
+
+    files = f"Experiments, {result.figure.name}, {DATA} and {COMMANDS}"
     print(f"{files}: {result.figure.parent}")
     terminal.print_next(*result.commands)
 

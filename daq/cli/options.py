@@ -121,7 +121,9 @@ def experiment_files(names: Sequence[str]) -> list[str]:
 
 def next_of_design(files: Sequence[str], out: Path | None) -> list[str]:
     """What serves after runs of a design into a folder, or before them; empty for others."""
-    if not all((Path(file).parent / "design.json").exists() for file in files):
+    from daq.designs.files import DATA
+
+    if not all(Path(file).with_name(DATA).exists() for file in files):
         return []
     from daq.designs.commands import commands_behind
 

@@ -43,6 +43,7 @@ def run(
     Of several all are checked before the first is run; what stops a run stops those behind it.
     """
     from daq.cli.analyse import next_commands
+    from daq.designs.files import COMMANDS
 
     with terminal.watching(json) as watch:
         files = options.experiment_files(experiments)
@@ -72,7 +73,7 @@ def run(
         if not session.plan.excites:
             _show_rest(result.run.folder, options.rig_words(rig, port))
         elif not identify:
-            commands = Path(files[0]).with_name("commands.txt")
+            commands = Path(files[0]).with_name(COMMANDS)
             if not behind and commands.exists():
                 terminal.print_text(
                     f"It is a run of a design, whose runs are identified together: {commands}"

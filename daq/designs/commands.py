@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from daq.config import json_file
-from daq.designs.runs import DATA
+from daq.designs.files import DATA
 from daq.designs.setup import Setup, beside
 from daq.errors import ConfigError
 from daq.identification.request import from_here, result_file
 from daq.identification.stages import load
 from daq.logs.capture import LOG_NAME
 
-FILE = "commands.txt"
 _ANEW = "design anew"
 
 
@@ -55,7 +54,7 @@ def experiments_of(name: str) -> list[str]:
     if not (folder / DATA).exists():
         cure = "name an experiment's file, or a folder that rig design wrote"
         raise ConfigError("no design was written there", cure=cure, file=folder)
-    return [str(folder / file) for file in _files(folder)]
+    return [str(folder / file) for file in _files(_design(folder), folder)]
 
 
 def commands_behind(experiments: Sequence[Path], out: Path | None) -> list[str]:
@@ -68,9 +67,9 @@ def commands_behind(experiments: Sequence[Path], out: Path | None) -> list[str]:
     folder = folders.pop()
     if folders or not (folder / DATA).exists():
         return []
-    design = json_file.load(folder / DATA, "design", _ANEW)
+    design = _design(folder)
     commands: list[str] = design.get("commands") or []
-    files = _files(folder)
+    files = _files(design, folder)
     names = {experiment.name for experiment in experiments}
     is_here = Path(design["runs"][0]["file"]).resolve() == (folder / files[0]).resolve()
     if not commands or not is_here or not names <= set(files):
@@ -82,9 +81,13 @@ def commands_behind(experiments: Sequence[Path], out: Path | None) -> list[str]:
     return [shlex.join(words)]
 
 
-def _files(folder: Path) -> list[str]:
+def _design(folder: Path) -> dict[str, Any]:
+    document: dict[str, Any] = json_file.load(folder / DATA, "design", _ANEW)
+    return document
+
+
+def _files(design: Mapping[str, Any], folder: Path) -> list[str]:
     """Names of a design's experiments, in order."""
-    design: dict[str, Any] = json_file.load(folder / DATA, "design", _ANEW)
     try:
         return [Path(run["file"]).name for run in design["runs"]]
     except (KeyError, TypeError) as error:

@@ -11,12 +11,12 @@ from typing import Any
 from daq.config import check, yaml_file
 from daq.config.yaml_file import TypedSettings
 from daq.designs import discrimination
-from daq.designs.commands import FILE as COMMANDS
 from daq.designs.commands import commands_of, text_of
 from daq.designs.discrimination import DiscriminationResult
+from daq.designs.files import COMMANDS, DATA, FIGURE
 from daq.designs.pictures import draw_design
 from daq.designs.result import DesignResult
-from daq.designs.runs import DATA, FIGURE, progress_of, write_runs
+from daq.designs.runs import progress_of, write_runs
 from daq.designs.setup import Setup, set_up, set_up_structures
 from daq.documents import plain
 from daq.files import write_whole

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from daq.designs.commands import FILE as COMMANDS
 from daq.designs.commands import commands_of, text_of
+from daq.designs.files import COMMANDS, DATA, FIGURE
 from daq.designs.pictures import draw_runs
 from daq.designs.result import RunsResult
-from daq.designs.runs import DATA, FIGURE, progress_of, write_runs
+from daq.designs.runs import progress_of, write_runs
 from daq.designs.setup import Setup
 from daq.documents import plain
 from daq.files import write_whole

@@ -16,7 +16,6 @@ from daq.lookup.shipped import find_file, shipped_files
 from daq.progress import Progress, Watch
 from sysid.experiments import DesignedRun
 
-DATA, FIGURE = "design.json", "design.png"
 _ALL = 2.0  # simulated runs for each one that a search asks for: what passes a limit is tried again
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from daq.config import check, yaml_file
 from daq.config.identification import Signals
+from daq.config.yaml_file import YamlFile
 from daq.errors import ConfigError, suggestion
 from daq.hal import FloatArray, Simulation
 from daq.identification.fit import take
@@ -218,14 +219,9 @@ def _parameters(
         values = dict(parameters.estimator.parameters_)
         return parameters.model, parameters.title, values, "identification"
     if parameters is not None:
-        path = result_file(parameters)
-        model, values = read_parameters(path, trust)
-        return (
-            model,
-            title_of(yaml_file.load(path).content["model"], model),
-            values,
-            str(parameters),
-        )
+        file = yaml_file.load(result_file(parameters))
+        model, values = _read(file, trust)
+        return model, title_of(file.content["model"], model), values, str(parameters)
     _, device = load_rig(rig)
     if not isinstance(device, Simulation):
         cure = "give those of an identification with --parameters"
@@ -244,8 +240,11 @@ def read_parameters(path: Path, trust: bool) -> tuple[ProcessModel, dict[str, fl
     trust: run the Python file of the model, where it is in one. Raises ConfigError naming line and
     key of what is missing or wrong.
     """
-    file = yaml_file.load(path)
-    name = file.content.get("model")
+    return _read(yaml_file.load(path), trust)
+
+
+def _read(file: YamlFile, trust: bool) -> tuple[ProcessModel, dict[str, float]]:
+    path, name = file.path, file.content.get("model")
     if not isinstance(name, str):
         raise file.error(("model",), "this key is missing; it names the process model")
     try:

@@ -314,13 +314,10 @@ class Identification(Shown):
         signals = settings.model_dump(mode="json", include=set(Signals.model_fields))
         starts = estimator.initial_states_
         profiles = {profile.name: _profile(profile) for profile in self.profiles}
+        assumptions = self.model.assumptions
         return {
             "model": self.problem.model_name,
-            **(
-                {"assumptions": list(assumptions)}
-                if (assumptions := self.model.assumptions)
-                else {}
-            ),
+            **({"assumptions": list(assumptions)} if assumptions else {}),
             # How the model was used where not as it declares; ``rig replay`` uses it likewise.
             **{key: value for key, value in signals.items() if value},
             "criterion": {

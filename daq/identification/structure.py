@@ -61,7 +61,6 @@ def examine(request: SettingsRequest) -> Structure:
     model = space.as_model()
     try:
         result = identifiability(model, seed=chosen.seed)
-
     except ModelError as error:
         raise ConfigError(str(error)) from None
     return Structure(title_of(problem.model_name, problem.model), model, result, chosen.tied)

@@ -41,9 +41,9 @@ class Finding:
     name, unit: as of its suspect. amplitude: of a channel's fault, in the unit; None of others.
     term: of a function the one that it is most like, with a range to fit it in; rivals: those of
     other shapes that it is like as well, between which fits decide. of_input: whether a channel is
-    an input. p_value: by chance,
-    all tests counted. share: of the whitened residuals' squares that it explains. moves: the
-    farthest first. wider: how many times as wide the interval is that it widens most.
+    an input. p_value: by chance, all tests counted. share: of the whitened residuals' squares that
+    it explains. moves: the farthest first. wider: how many times as wide the interval is that it
+    widens most.
     """
 
     kind: Kind

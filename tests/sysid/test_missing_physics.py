@@ -133,6 +133,16 @@ DRIVE = ProcessModel(
 )
 
 
+def by_scipy(model, derivative, inputs, dt):
+    """Outputs of a model's plant, whose equations have their numbers in them, (n, n_outputs)."""
+    real, nothing = (
+        replace(model, derivative=derivative),
+        np.zeros((len(inputs), len(model.outputs))),
+    )
+    numbers = np.ones(len(model.parameters))
+    return simulate(real, numbers, Dataset(inputs, nothing, dt), rtol=1e-7)
+
+
 def drive_log(cogging, seed=0, n=1200, dt=2e-3):
     """A linear drive over the magnets of its track, which pull it along and back, by SciPy."""
     rng, turning = np.random.default_rng(seed), 2.0 * np.pi / PITCH
@@ -142,8 +152,7 @@ def drive_log(cogging, seed=0, n=1200, dt=2e-3):
         pull = cogging * np.sin(turning * x[0] + 0.7)
         return x[1], 22.0 * u[0] - 9.0 * x[1] + pull
 
-    real = replace(DRIVE, derivative=derivative)
-    exact = simulate(real, np.ones(2), Dataset(inputs, np.zeros((n, 2)), dt), rtol=1e-7)
+    exact = by_scipy(DRIVE, derivative, inputs, dt)
     return Dataset(inputs, exact + [2e-5, 2e-3] * rng.standard_normal((n, 2)), dt)
 
 
@@ -164,17 +173,24 @@ def test_a_force_that_repeats_with_a_position_is_named_with_its_period(cogging):
     assert "that repeats with x (every 0.024), like cogging" in " ".join(verdict.reasons)
 
 
-COIL = ProcessModel(
-    name="coil",
-    states=(State("x", "m"), State("v", "m/s")),
-    inputs=(Input("force", "N", "zoh"),),
-    outputs=(Output("x", "m"),),
-    parameters=(
-        Parameter("mass", "kg", 0.1, 0.01, 1.0, "log"),
-        Parameter("damping", "N*s/m", 1.0, 0.1, 10.0, "log"),
-        Parameter("stiffness", "N/m", 100.0, 10.0, 2000.0, "log"),
-    ),
-    derivative=lambda x, u, p: (x[1], (u[0] - p[1] * x[1] - p[2] * x[0]) / p[0]),
+def on_a_spring(name, force, *parameters):
+    """A mass between a spring and a damper, of which the position is measured."""
+    return ProcessModel(
+        name=name,
+        states=(State("x", "m"), State("v", "m/s")),
+        inputs=(force,),
+        outputs=(Output("x", "m"),),
+        parameters=parameters,
+        derivative=lambda x, u, p: (x[1], (u[0] - p[1] * x[1] - p[2] * x[0]) / p[0]),
+    )
+
+
+COIL = on_a_spring(
+    "coil",
+    Input("force", "N", "zoh"),
+    Parameter("mass", "kg", 0.1, 0.01, 1.0, "log"),
+    Parameter("damping", "N*s/m", 1.0, 0.1, 10.0, "log"),
+    Parameter("stiffness", "N/m", 100.0, 10.0, 2000.0, "log"),
 )
 
 
@@ -189,8 +205,7 @@ def test_a_spring_that_hardens_is_no_cogging_and_no_other_power(hardening):
         def derivative(x, u, p):
             return x[1], (u[0] - 1.4 * x[1] - 220.0 * x[0] - hardening * x[0] ** 3) / 0.12
 
-        real = replace(COIL, derivative=derivative)
-        exact = simulate(real, np.ones(3), Dataset(force, np.zeros((n, 1)), dt), rtol=1e-7)
+        exact = by_scipy(COIL, derivative, force, dt)
         return Dataset(force, exact + 5e-5 * rng.standard_normal((n, 1)), dt)
 
     training, validation = log(1), log(2)
@@ -613,17 +628,12 @@ def test_residuals_may_follow_an_only_input_whose_noise_is_known():
     assert verdict.trust == "good", verdict.reasons
 
 
-OSCILLATOR = ProcessModel(
-    name="oscillator",
-    states=(State("x", "m"), State("v", "m/s")),
-    inputs=(Input("force", "N"),),
-    outputs=(Output("x", "m"),),
-    parameters=(
-        Parameter("m", "kg", 2.0, 0.2, 20.0, "log"),
-        Parameter("c", "N*s/m", 5.0, 0.5, 50.0, "log"),
-        Parameter("k", "N/m", 4000.0, 250.0, 25000.0, "log"),
-    ),
-    derivative=lambda x, u, p: (x[1], (u[0] - p[1] * x[1] - p[2] * x[0]) / p[0]),
+OSCILLATOR = on_a_spring(
+    "oscillator",
+    Input("force", "N"),
+    Parameter("m", "kg", 2.0, 0.2, 20.0, "log"),
+    Parameter("c", "N*s/m", 5.0, 0.5, 50.0, "log"),
+    Parameter("k", "N/m", 4000.0, 250.0, 25000.0, "log"),
 )
 
 

@@ -1,0 +1,3 @@
+"""Names of the files of a design, beside its experiments."""
+
+DATA, FIGURE, COMMANDS = "design.json", "design.png", "commands.txt"
