@@ -31,7 +31,7 @@ from daq.lookup.models import DRIVEN_MODEL, whole_name
 from daq.lookup.rigs import load_rig
 from daq.notation import quantity
 from daq.progress import Note, Started, Watch, ignore
-from daq.recording.session import record
+from daq.recording.session import SEEDS, first_seed, record
 from daq.report.publication import publish
 from daq.views import Lines, Shown
 from sysid import Design
@@ -39,7 +39,6 @@ from sysid import Design
 _FIRST = 0.25  # of the time, for a first round, from what little is known
 _LATER = 0.5  # of what is left, for each that follows
 _LEAST = 2  # runs of a last round: fewer join the round before
-_SEEDS = 2**32  # that a simulated rig takes
 _WORTH = 0.9  # of the widths, to which another mounting must be expected to bring them
 _NO_RUN = "no run within the limits would tell more"
 _GAIN = 0.98  # of the widths, to which a round must be expected to bring them
@@ -350,13 +349,14 @@ def _run(current: Round, done: Sequence[Round], watch: Watch) -> None:
     """
     config, _ = load_rig(current.rig, watch=watch)
     has_noise = "seed" in type(config.options).model_fields
-    seed: int = getattr(config.options, "seed", None) or 0
+    chosen: int | None = getattr(config.options, "seed", None)
+    seed = first_seed(current.runs) if chosen is None else chosen
     first = sum(len(each.experiments) for each in done)
     for place, experiment in enumerate(current.experiments, first):
         if current.is_left_out(experiment):
             watch(Note("warning", f"{experiment.stem} is left out: limits have stopped it twice"))
         elif not current.captures(experiment):
-            options = {"seed": (seed + place) % _SEEDS} if has_noise else None
+            options = {"seed": (seed + place) % SEEDS} if has_noise else None
             record(experiment, current.rig, current.runs, options=options, watch=watch)
     if not _logs([*done, current]):
         cure = "see why in the run.json of each, then characterise anew"

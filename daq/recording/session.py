@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,6 +27,7 @@ from daq.recording.analysis import conclude_or_warn
 from daq.run.runner import RunResult, run_experiment
 from daq.run.sampling import PhaseProgress
 
+SEEDS = 2**32  # that a simulated rig takes
 _ACTIVITIES = {
     Phase.CALIBRATION: "Offset calibration",
     Phase.HOMING: "Winding the load",
@@ -151,6 +153,19 @@ def _noting(loaded: LoadedExperiment, notes: list[str]) -> LoadedExperiment:
     return replace(loaded, experiment=loaded.experiment.model_copy(update={"metadata": metadata}))
 
 
+def first_seed(folder: Path) -> int:
+    """Seed of the first simulated run of a folder: 0, or in a folder of runs by its name.
+
+    Runs of a design stand beside those before it, and are identified with them.
+
+    >>> first_seed(Path("runs")), first_seed(Path("runs/design")) == first_seed(Path("runs/other"))
+    (0, False)
+    """
+    whole, here = folder.resolve(), Path.cwd()
+    inner = whole.relative_to(here) if whole.is_relative_to(here) else Path(whole.name)
+    return zlib.crc32(inner.as_posix().encode()) if len(inner.parts) > 1 else 0
+
+
 def _with_noise_of_its_own(rig: RigConfig, device: Device, out: Path) -> tuple[RigConfig, Device]:
     """A simulated rig whose file names no seed, with that of the next run in a folder.
 
@@ -159,7 +174,8 @@ def _with_noise_of_its_own(rig: RigConfig, device: Device, out: Path) -> tuple[R
     options = rig.options
     if "seed" not in type(options).model_fields or getattr(options, "seed", None) is not None:
         return rig, device
-    options = options.model_copy(update={"seed": sum(1 for _ in out.glob(f"*/{RUN_NAME}"))})
+    seed = (first_seed(out) + sum(1 for _ in out.glob(f"*/{RUN_NAME}"))) % SEEDS
+    options = options.model_copy(update={"seed": seed})
     make: Callable[[Any], Device] = type(device)
     return rig.model_copy(update={"options": options}), make(options)
 

@@ -46,7 +46,9 @@ def test_a_recorded_run_is_the_one_the_command_records(recorded):
 
 
 @pytest.mark.parametrize("seed", [None, 5])
-def test_runs_on_a_simulated_rig_share_noise_only_where_its_file_names_a_seed(tmp_path, seed):
+def test_runs_on_a_simulated_rig_share_noise_only_where_its_file_names_a_seed(
+    tmp_path, monkeypatch, seed
+):
     """Logs of one noise confirm each other's errors, and are refused as copies."""
     write_experiment(tmp_path / "e.yaml")
     rig_file = write_yaml(tmp_path / "rig.yaml", {"options": {"seed": seed} if seed else {}})
@@ -57,6 +59,11 @@ def test_runs_on_a_simulated_rig_share_noise_only_where_its_file_names_a_seed(tm
     noise = [np.diff(run.frame["torque"], 3) for run in runs]
     shared = np.corrcoef(noise)[np.triu_indices(3, 1)]
     assert np.all(shared == pytest.approx(1.0)) if seed else np.all(np.abs(shared) < 0.3)
+    # Nor with those of a design, which are in a folder of their own and identified with them.
+    monkeypatch.chdir(tmp_path)
+    nested = [record("e.yaml", "rig.yaml", f"runs/{name}") for name in ("design", "second")]
+    seeds += [run.record["rig"]["options"]["seed"] for run in nested]
+    assert len(set(seeds)) == (1 if seed else 5)
     # What is written down makes the same run anew.
     again = record(tmp_path / "e.yaml", rig_file, tmp_path / "new", options={"seed": seeds[1]})
     assert again.frame.equals(runs[1].frame)
