@@ -89,12 +89,12 @@ class RunEntry:
     def document(self) -> dict[str, Any]:
         """The same for machines."""
         document = asdict(self)
-        del document["rows"]
-        return {**document, "quantities": [asdict(row) for row in self.quantities]}
+        rows = from_json(document.pop("rows"))
+        return {**document, "quantities": [dict(zip(_FIELDS, row, strict=True)) for row in rows]}
 
     def quantity(self, name: str) -> QuantityRow | None:
         """An identified parameter or combination; None where it has none of that name."""
-        return next((row for row in self.quantities if row.name == name), None)
+        return next((_quantity(row) for row in from_json(self.rows) if row[0] == name), None)
 
 
 def captures(root: Path) -> Iterator[tuple[str, str]]:

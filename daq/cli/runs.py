@@ -115,7 +115,8 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str, room: i
         terminal.report("note", f"the last {room} are shown; --last N shows so many")
         entries = entries[-room:]
     noted = list(dict.fromkeys(key for entry in entries for key in entry.metadata))
-    units = {row.name: row.unit for entry in entries for row in entry.quantities}
+    quantities = [[entry.quantity(name) for name in names] for entry in entries]
+    units = {row.name: row.unit for shown in quantities for row in shown if row is not None}
     titles = [f"{name} [{units[name]}]" if name in units else name for name in names]
     head = ["run", "date (UTC)", *_FACTS, *titles, *noted]
     rows = [
@@ -123,10 +124,10 @@ def _list(entries: Sequence[RunEntry], names: Sequence[str], title: str, room: i
             entry.folder,
             entry.started[:16].replace("T", " "),
             *(str(getattr(entry, fact)) for fact in _FACTS),
-            *(_quantity(entry.quantity(name)) for name in names),
+            *map(_quantity, shown),
             *(_text(entry.metadata.get(key, "")) for key in noted),
         ]
-        for entry in entries
+        for entry, shown in zip(entries, quantities, strict=True)
     ]
     kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
     if sys.stdout.isatty() and all(map(_is_dated, entries)):
@@ -194,7 +195,8 @@ def _show(entry: RunEntry, folder: Path) -> None:
             terminal.print_text(f"{key}: {value}")
     if entry.quantities:
         rows = [
-            [row.name, *_cells(row), row.unit, row.undetermined_label] for row in entry.quantities
+            [row.name, row.text(row.value), _ends(row), row.unit, row.undetermined_label]
+            for row in entry.quantities
         ]
         head = ["name", "value", "95 % interval", "unit", "note"]
         terminal.print_table("Parameters", head, rows, text=["unit", "note"])
@@ -206,14 +208,14 @@ def _quantity(row: QuantityRow | None, between: str = "") -> str:
     """A value, and its interval in brackets behind ``between``; empty where there is none."""
     if row is None:
         return ""
-    value, ends = _cells(row)
-    if not ends:
+    value = row.text(row.value)
+    if row.interval in (None, (None, None)):
         return f"({value})"  # no data stand behind it
-    return f"{value}{between}({ends})" if between else value
+    return f"{value}{between}({_ends(row)})" if between else value
 
 
-def _cells(row: QuantityRow) -> tuple[str, str]:
-    return row.text(row.value), row.interval_text(row.text, " .. ", "")
+def _ends(row: QuantityRow) -> str:
+    return row.interval_text(row.text, " .. ", "")
 
 
 def _text(value: object) -> str:
