@@ -3,11 +3,10 @@
 import functools
 import os
 import re
-import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from inspect import Parameter, cleandoc, signature
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from typer import BadParameter, Exit, Option, Typer
 from typer.core import TyperGroup
@@ -131,14 +130,9 @@ class _Commands(TyperGroup):
             raise
 
 
-# Frames are for people: in a pipe help and errors are plain lines.
-_MARKUP: Literal["rich"] | None = "rich" if sys.stderr.isatty() else None
-
-
 def _register(group: Typer, name: str | None, command: Callable[..., None], example: str) -> None:
-    """Add a command; its docstring is its help, a line for each paragraph, brackets kept."""
+    """Add a command; its docstring is its help, a line for each paragraph."""
     text = re.sub(r"(?<!\n)\n(?!\n)", " ", cleandoc(command.__doc__ or ""))
-    text = text.replace("[", r"\[") if _MARKUP else text
     group.command(name, help=text, epilog=f"Example:  {example}")(_with_volume(command))
 
 
@@ -151,7 +145,7 @@ app = Typer(
         "Start with:  rig run prbs.yaml --identify"
     ),
     no_args_is_help=True,
-    rich_markup_mode=_MARKUP,
+    rich_markup_mode=None,  # whose frames and columns left texts of 22 letters at 80 columns
     pretty_exceptions_enable=False,
 )
 for _command, _example in _COMMANDS:

@@ -32,6 +32,7 @@ def check(
     draws: Annotated[
         int,
         Option(
+            metavar="N",
             min=0,
             max=100_000,
             help="Simulated trials where a torque controller acts, each with a plausible actuator "

@@ -39,7 +39,13 @@ def doctor(
         ),
     ] = False,
     wakes: Annotated[
-        int, Option(min=2, max=1_000_000, help="Times to wake from sleep, half of them under load.")
+        int,
+        Option(
+            metavar="N",
+            min=2,
+            max=1_000_000,
+            help="Times to wake from sleep, half of them under load.",
+        ),
     ] = 20_000,
     out: options.RunsFolder = Path("runs"),
     json: options.AsJson = False,

@@ -22,7 +22,7 @@ def ports(
     unasked: Annotated[
         bool, Option("--list", help="Send nothing: list the ports without asking.")
     ] = False,
-    baud: Annotated[int, Option(help="Of UARTs; USB does not care.")] = 2_000_000,
+    baud: Annotated[int, Option(metavar="BAUD", help="Of UARTs; USB does not care.")] = 2_000_000,
     json: options.AsJson = False,
 ) -> None:
     """List serial ports, and who answers there."""

@@ -22,7 +22,8 @@ def scope(
         "runs"
     ),
     port: Annotated[
-        int | None, Option(min=0, max=65535, help="Of the page; default 5006, 0 for any.")
+        int | None,
+        Option(metavar="N", min=0, max=65535, help="Of the page; default 5006, 0 for any."),
     ] = None,
     browser: Annotated[
         bool, Option("--browser/--no-browser", help="Open a browser on the page.")

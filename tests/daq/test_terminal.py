@@ -42,6 +42,20 @@ def test_every_command_has_the_common_options_and_an_example(name):
     assert COMMANDS[name].help and COMMANDS[name].epilog.startswith("Example:")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no such terminal")
+@pytest.mark.parametrize("name", ["identify", "run", "emulate"])
+def test_help_leaves_half_of_eighty_columns_to_its_texts(tmp_path, name):
+    shown = on_terminal([name, "--help"], tmp_path, 80)
+    options = shown.partition("\nOptions:\n")[2]
+    behind = re.findall(r"^  -.*?  +(?=\S)", options, re.M)
+    assert len(behind) > 5
+    assert max(map(len, behind)) <= 36
+    assert max(map(len, shown.splitlines())) <= 80
+    words = " ".join(options.split())
+    for parameter in COMMANDS[name].params[1:]:
+        assert " ".join(parameter.help.split()) in words
+
+
 @pytest.fixture(scope="module")
 def said(tmp_path_factory):
     """What a run says quietly, usually and verbosely, by option."""
