@@ -48,6 +48,7 @@ class Tape:
         self._values = None if point is None else dict(point)
         self._lines: dict[str, Line] = {}  # by text: what is computed twice is written once
         self._by_name: dict[str, Line] = {}
+        self._literals: dict[str, tuple[str, tuple[str, ...]]] = {}  # form and operands, by text
 
     @property
     def lines(self) -> list[Line]:
@@ -58,6 +59,7 @@ class Tape:
         """Name of the result of an operation, ``form`` with places for its operands."""
         text = form.format(*operands)
         if not any(map(self.named, operands)):
+            self._literals[f"({text})"] = form, operands
             return f"({text})"  # literals alone: the compiler folds them
         if text not in self._lines:
             fixed = all(map(self.fixed, operands))
@@ -85,7 +87,12 @@ class Tape:
     def value(self, operand: str) -> Any:
         """What a name or a literal stands for at the tape's point."""
         assert self._values is not None
-        return self._values[operand] if operand in self._values else constant(operand)
+        if operand in self._values:
+            return self._values[operand]
+        if operand not in self._literals:
+            return constant(operand)
+        form, operands = self._literals[operand]
+        return self._arithmetic(form, len(operands))(*map(self.value, operands))
 
     def fixed(self, operand: str) -> bool:
         """Whether a name or a literal depends on the parameters alone."""

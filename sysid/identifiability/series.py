@@ -69,7 +69,10 @@ def _power(a: Any, b: Any) -> Any:
 
 
 def _power_slope(a: Any, b: Any, da: Any) -> Any:
-    return b * _power(a, b - 1) * da if sign(b) and sign(da) else arb(0)
+    if not (sign(b) and sign(da)):
+        return arb(0)
+    whole = isinstance(b, (int, float)) and float(b).is_integer()
+    return b * _power(a, b - 1 if whole else _lifted(b) - 1) * da
 
 
 def _exponent_slope(a: Any, power: Any, db: Any) -> Any:
@@ -111,6 +114,11 @@ def _comparison(holds: Callable[[int], bool]) -> Callable[[Any, Any], bool]:
 
 
 _FORMS: dict[str, Callable[..., Any]] = {
+    # Of two literals, too, in all digits: 1 / 0.2 rounded is not what x / 0.2 moves by.
+    "{} + {}": lambda a, b: _lifted(a) + b,
+    "{} - {}": lambda a, b: _lifted(a) - b,
+    "{} * {}": lambda a, b: _lifted(a) * b,
+    "{} / {}": lambda a, b: _lifted(a) / b,
     "{} < {}": _comparison(lambda s: s < 0),
     "{} <= {}": _comparison(lambda s: s <= 0),
     "{} > {}": _comparison(lambda s: s > 0),

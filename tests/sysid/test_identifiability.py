@@ -42,6 +42,21 @@ def process(states, inputs, parameters, derivative, outputs, output=None, starts
     )
 
 
+@pytest.mark.parametrize(
+    "derivative",
+    [
+        lambda x, u, p: ((p[0] * u[0] - x[0]) / 0.2,),
+        lambda x, u, p: (p[0] * u[0] / 3.0 - 0.1 * x[0] * 0.7,),
+        lambda x, u, p: (p[0] * ((u[0] ** 2 + 1.0) / 0.3) ** 0.3 - x[0] / 0.7,),
+    ],
+)
+def test_constants_that_no_binary_fraction_is_part_nothing(derivative):
+    model = process("x", "u", "a b", derivative, "y", lambda x, u, p: (p[1] * x[0],))
+    directions = null_directions(model, model.nominal, ["a", "b"], ["x"])
+    assert directions.shape == (1, 3)  # the product of both stays, their nominal values being alike
+    assert directions[0, 0] == pytest.approx(-directions[0, 1])
+
+
 def goodwin(x, u, p):
     b, c, alpha, beta, gama, delta, sigma = p
     rate = gama * x[1] - delta * x[2]
