@@ -158,8 +158,16 @@ def engineering(value: float, unit: str) -> tuple[float, str]:
 def quantity(value: float, unit: str, digits: int = 3) -> str:
     """A number with its unit, in the multiple of it that reads best: ``5.06 mA``."""
     scale, multiple = engineering(value, unit)
-    text = number(scale * value, digits)
-    return text if multiple in ("", "1") else f"{text} {multiple}"
+    return with_unit(number(scale * value, digits), multiple)
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Numbers as written, and their unit behind them if they have any.
+
+    >>> with_unit("3.0 .. 3.2", "mm"), with_unit("3.0", "1")
+    ('3.0 .. 3.2 mm', '3.0')
+    """
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 def measured(value: float, unit: str, half_width: float | None) -> tuple[str, str]:

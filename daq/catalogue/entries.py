@@ -203,7 +203,7 @@ def _facts(document: Mapping[str, Any]) -> dict[str, Any]:
         "model": str(document["model"]),
         "trust": str(verdict["trust"]),
         **statements,
-        "rows": json.dumps([_plain(row) for row in (*searched, *rows.combinations)]),
+        "rows": json.dumps([_plain(row) for row in (*searched, *rows.combinations, *rows.starts)]),
     }
 
 

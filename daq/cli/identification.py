@@ -19,8 +19,10 @@ if TYPE_CHECKING:
     from daq.identification.rows import (
         OutputErrors,
         ParameterRow,
+        QuantityRow,
         RivalRow,
         Rows,
+        StartRow,
     )
     from sysid import Campaign
     from sysid.judging.comparison import Comparison, Row
@@ -194,21 +196,19 @@ def _rival_row(row: ParameterRow, rivals: Sequence[RivalRow]) -> list[str]:
 
 def _show_products(rows: Rows) -> None:
     """Products and sums that the data determine, of parameters that they do not."""
+    from daq.identification.rows import StartRow, by_state
+
     for index, ambiguity in enumerate(rows.ambiguities_of("tied")):
         if index == 0:
             print("What no data of these outputs can tell apart:")
-        terminal.print_text(f"  {', '.join(ambiguity.parameters)} act only together.")
+        names = dict.fromkeys(map(by_state, ambiguity.parameters))
+        terminal.print_text(f"  {', '.join(names)} act only together.")
         for row in ambiguity.determined:
-            scale, unit = row.engineering
-            value = row.text(row.value, scale)
-            quantity = value if unit in {"", "1"} else f"{value} {unit}"
-            interval = row.span(scale)
-            ends = f"95 % interval {interval}" if row.interval else row.undetermined_label
-            terminal.print_text(f"    {row.name} = {quantity}, {ends}")
-        for name in ambiguity.parameters:
-            state, _, log = name.partition("(0) ")
-            if log == "1":  # of several, which are numbered alike
-                terminal.print_text(f"    {name} is where {state} starts in the first log.")
+            if not row.is_start:
+                terminal.print_text(f"    {_determined(row)}")
+        for start in StartRow.grouped(row for row in ambiguity.determined if row.is_start):
+            alone = len(start.rows) == 1
+            terminal.print_text(f"    {_determined(start.rows[0]) if alone else _starts(start)}")
         starts = [name for name in ambiguity.measure if "(0)" in name]
         measure = " and ".join(name for name in ambiguity.measure if name not in starts)
         if measure:
@@ -222,6 +222,24 @@ def _show_products(rows: Rows) -> None:
                 f"    {'Give' if not measure else 'Give also'} the start of {states} under "
                 "'initial'."
             )
+
+
+def _determined(row: QuantityRow) -> str:
+    scale, unit = row.engineering
+    ends = f"95 % interval {row.span(scale)}" if row.interval else row.undetermined_label
+    return f"{row.name} = {notation.with_unit(row.text(row.value, scale), unit)}, {ends}"
+
+
+def _starts(start: StartRow) -> str:
+    """A combination with the starts of several logs, of which parameters.yaml has each."""
+    scale, unit = start.rows[0].engineering
+
+    def span(ends: tuple[float, float]) -> str:
+        return " .. ".join(start.rows[0].text(end, scale) for end in ends)
+
+    values = notation.with_unit(span(start.values), unit)
+    ends = f", 95 % intervals within {span(start.interval)}" if start.interval else ""
+    return f"{start.name} = {values} in the {len(start.rows)} logs{ends}"
 
 
 def _show_profiles(profiles: Sequence[Profile]) -> None:

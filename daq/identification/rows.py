@@ -7,6 +7,7 @@ Numbers that JSON cannot hold, and errors of outputs that were not measured, are
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,6 +26,8 @@ LABELS = {  # of undetermined reasons
     "": "",
 }
 
+
+_START = "(0)"  # behind a state, in the name of its start; of several logs a number follows
 
 Interval = tuple[float | None, float | None]
 """Ends of an interval, None on a side on which the data set none."""
@@ -46,6 +49,11 @@ class QuantityRow:
     undetermined: str = ""
     here: Interval | None = None
     fails: float = 0.0
+
+    @property
+    def is_start(self) -> bool:
+        """Whether it holds where a state starts in a log, which tells nothing of the system."""
+        return _START in self.name
 
     @property
     def digits(self) -> int:
@@ -345,6 +353,15 @@ class Rows(Shown):
     @cached_property
     def combinations(self) -> tuple[QuantityRow, ...]:
         """Combinations of parameters that have an interval."""
+        return tuple(row for row in self._combined if not row.is_start)
+
+    @cached_property
+    def starts(self) -> tuple[QuantityRow, ...]:
+        """Combinations with starts of states in the logs that have an interval."""
+        return tuple(row for row in self._combined if row.is_start)
+
+    @cached_property
+    def _combined(self) -> tuple[QuantityRow, ...]:
         combined = (row for ambiguity in self.ambiguities for row in ambiguity.determined)
         return tuple(row for row in combined if row.interval is not None)
 
@@ -361,6 +378,9 @@ class Rows(Shown):
         if self.combinations:
             n = len(self.combinations)
             parts.append(f"{n} combination{'' if n == 1 else 's'}")
+        if self.starts:
+            n = len(self.starts)
+            parts.append("1 start of a log" if n == 1 else f"{n} starts of logs")
         last = f" and {parts.pop()}" if len(parts) > 1 else ""
         return f"{', '.join(parts)}{last}"
 
@@ -388,7 +408,7 @@ class Rows(Shown):
     @property
     def together_sentence(self) -> str:
         """How surely all intervals hold at once; empty of fewer than two."""
-        n = len(self.determined) + len(self.bounded) + len(self.combinations)
+        n = len(self.determined) + len(self.bounded) + len(self._combined)
         if self.together is None or n < 2:
             return ""
         coverage, widening = self.together
@@ -428,6 +448,45 @@ def logs_of(metrics: Mapping[str, Any], part: str) -> tuple[LogErrors, ...]:
         LogErrors(log.get("name", ""), {k: OutputErrors.of(e) for k, e in log["outputs"].items()})
         for log in metrics[part]
     )
+
+
+def by_state(name: str) -> str:
+    """A name in which starts are those of a state in whichever log.
+
+    >>> by_state("alpha1 z(0) 11")
+    'alpha1 z(0)'
+    """
+    return re.sub(rf"({re.escape(_START)}) \d+", r"\1", name)
+
+
+@dataclass(frozen=True)
+class StartRow:
+    """A combination with the start of a state, in each of some logs."""
+
+    name: str
+    rows: tuple[QuantityRow, ...]
+
+    @classmethod
+    def grouped(cls, rows: Iterable[QuantityRow]) -> list[StartRow]:
+        """Of all rows with starts, a group for those that differ by the log alone."""
+        groups: dict[str, list[QuantityRow]] = {}
+        for row in rows:
+            groups.setdefault(by_state(row.name), []).append(row)
+        return [cls(name, tuple(group)) for name, group in groups.items()]
+
+    @property
+    def values(self) -> tuple[float, float]:
+        """The least and the largest."""
+        values = [row.value for row in self.rows]
+        return min(values), max(values)
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """What their 95 % intervals reach over; None where any of them has not both ends."""
+        if not all(row.two_sided for row in self.rows):
+            return None
+        ends = [end for row in self.rows for end in row.interval or () if end is not None]
+        return min(ends), max(ends)
 
 
 def start_sentences(logs: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -6,7 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.identification.request import from_here, set_options
-from daq.identification.rows import OutputErrors, Rows, logs_of, mean_errors, start_sentences
+from daq.identification.rows import (
+    OutputErrors,
+    Rows,
+    StartRow,
+    logs_of,
+    mean_errors,
+    start_sentences,
+)
 from daq.lookup.models import title_of, trust_option
 from sysid import ProcessModel
 
@@ -33,7 +40,7 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
     comparison, search = document["comparison"], document["search"]
     logs = rows.logs["training"]
     quantities = [*rows.determined, *rows.bounded, *rows.combinations]
-    names = " ".join(row.name for row in quantities)
+    names = " ".join(row.name for row in rows.starts)
     unrefined = f"the preset {search['preset']} does not refine to a minimum"
     interrupted = search["stopped"] == "interrupted"
     return {
@@ -42,6 +49,7 @@ def view(model: ProcessModel, document: Mapping[str, Any], rows: Rows) -> dict[s
         "model": model,
         "model_title": title_of(document["model"], model),
         "quantities": quantities,
+        "grouped_starts": StartRow.grouped,
         "determined": _determined(document, rows),
         "data_sentence": _data_sentence(document["reproduction"]["logs"]),
         "tables": {

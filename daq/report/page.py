@@ -12,7 +12,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from daq import notation
-from daq.identification.rows import QuantityRow, Rows
+from daq.identification.rows import QuantityRow, Rows, by_state
 from daq.report.explanation import view
 from sysid import ProcessModel
 from sysid.judging.comparison import above, times
@@ -80,6 +80,7 @@ def rendered(
         "jointed": lambda name: Markup(_JOINT.sub("<wbr>", str(escape(name)))),
         "measured": _measured,
         "prose": notation.prose,
+        "by_state": by_state,
         "times": lambda ratio: _marked(ratio, times),
         "above": lambda criterion: _marked(criterion, above),
         "percent": lambda value: _marked(value, notation.percent),

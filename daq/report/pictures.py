@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 
 _MOTIONS = {"N": ("m", "m/s"), "N*m": ("rad", "rad/s")}  # that a force or torque is drawn over
 _OUTPUTS_A_FIGURE = 4
-_START = "(0)"  # behind the state, in the name of what a record starts from
 _DRAWS = 24  # of the parameters, for bands
 _CLOSER = 60  # samples of a prepared log that are shown closer, as delays are of a few
 _LOGS_A_PART = 3  # of more logs the worst, the middle and the best are shown
@@ -272,20 +271,18 @@ def _parameters(rows: Rows) -> Iterator[Picture]:
                 [row.label for row in rows.free],
             ),
         )  # fmt: skip
-    quantities = {
+    drawn = {
         row.name: (row.value, *row.interval)
         for row in (*rows.determined, *rows.combinations)
         if row.interval is not None and row.two_sided
     }
-    starts = [name for name in quantities if _START in name]
-    drawn = {name: ends for name, ends in quantities.items() if name not in starts}
     if drawn:
-        left_out = f"{len(starts)} start{'s' * (len(starts) > 1)} of states in the logs"
+        left_out = f"{len(rows.starts)} start{'s' * (len(rows.starts) > 1)} of states in the logs"
         yield Picture(
             "intervals", "parameters",
             "95 % intervals of all that the data determine on both sides: parameters by "
             "themselves, and combinations of those that act only together."
-            f"{f' Of {left_out} the table has the intervals.' if starts else ''}",
+            f"{f' Of {left_out} the table has the intervals.' if rows.starts else ''}",
             intervals(list(drawn), np.array(list(drawn.values()))),
         )  # fmt: skip
     names = [row.name for row in rows.determined]

@@ -364,6 +364,40 @@ def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captur
     assert not any("(0)" in label for label in labels)
 
 
+def test_starts_of_many_logs_are_a_line_and_no_parameters(command, tmp_path):
+    (tmp_path / "hidden.py").write_text(
+        "from sysid import Input, Output, Parameter, ProcessModel, State\n"
+        "model = ProcessModel(\n"
+        "    name='hidden', inputs=(Input('u', 'V'),), outputs=(Output('y', 'm'),),\n"
+        "    states=(State('x', 'A', initial_range=(-3.0, 3.0)),),\n"
+        "    parameters=(Parameter('a', 'A/V', 1.0, 0.1, 10.0, 'log'),\n"
+        "                Parameter('b', 'm/A', 1.0, 0.1, 10.0, 'log')),\n"
+        "    derivative=lambda x, u, p: ((p[0] * u[0] - x[0]) / 0.2,),\n"
+        "    output=lambda x, u, p: (p[1] * x[0],),\n"
+        ")\n"
+    )
+    logs = [f"log{k}.csv" for k in range(4)]
+    for k, log in enumerate(logs):
+        write_log(tmp_path / log, k)
+    words = ["--model", "hidden.py:model", "--population", 40, "--generations", 8]
+    result = command(["identify", *logs, *words, "--out", "all"], tmp_path, report=True)
+    assert result.returncode == 0, result.stderr
+    text = " ".join(result.stdout.split())
+    assert "each by itself, 1 combination and 4 starts of logs." in text
+    assert re.search(r"(a, b, x\(0\)|b, a, x\(0\)|x\(0\), \w, \w) act only together\.", text)
+    document = yaml.safe_load((tmp_path / "all" / "parameters.yaml").read_text("utf-8"))
+    (exact,) = document["ambiguities"]
+    starts = {row["name"]: row["value"] for row in exact["determined"] if "(0)" in row["name"]}
+    assert len(starts) == 4
+    first = next(iter(starts))
+    (shown,) = re.findall(rf"{re.escape(first[:-2])} = (\S+ \.\. \S+) \S+ in the 4 logs", text)
+    assert ends(shown) == pytest.approx([min(starts.values()), max(starts.values())], rel=0.1)
+    page = (tmp_path / "all" / "report.html").read_text("utf-8")
+    folded = page.partition('<details id="starts">')[2].partition("</details>")[0]
+    assert all(f'data-quantity="{name}"' in folded for name in starts)
+    assert page.count(f'"{first}"') == folded.count(f'"{first}"')
+
+
 def test_the_command_line_refuses_it_too(command, captured, record):
     path = captured / RUN_NAME
     path.write_text(json.dumps({**record, "calibration": {"noise": {"torque": -1}}}))
