@@ -415,6 +415,7 @@ def setting_of(term: AddedTerm) -> TermSetting:
     """What makes a term in a configuration."""
     values = dataclasses.asdict(term)
     ends = values.pop("low"), values.pop("high")
+    del values["unit"]
     return TermSetting(**values, range=ends)
 
 

@@ -80,7 +80,7 @@ def _cycle(runs: Sequence[DisturbedRun], way: _Way, period: float) -> Suspect:
     """A sine and a cosine of this period in the position's unit."""
     equation, scale = runs[0].model.states[way.equation].name, period / (2.0 * math.pi)
     terms = tuple(
-        AddedTerm(equation, way.name, "sine", scale, -1.0, 1.0, centre)
+        AddedTerm(equation, way.name, "sine", scale, -1.0, 1.0, centre, way.unit)
         for centre in (0.0, -0.25 * period)
     )
     suspect = of_terms(runs, way.equation, way.along, terms)

@@ -162,7 +162,7 @@ def _term_text(term: AddedTerm) -> str:
     if term.shape == "sign" and term.of == term.equation and term.centre == 0.0:
         return f"a term in the sign of {term.of} in {equation}, like dry friction"
     if term.shape == "sine":
-        period = f"{2.0 * math.pi * term.scale:.3g}"
+        period = sized(2.0 * math.pi * term.scale, term.unit)
         return f"a term in {equation} that repeats with {term.of} (every {period}), like cogging"
-    about = f" about {term.centre:g}" if term.centre else ""
+    about = f" about {sized(term.centre, term.unit)}" if term.centre else ""
     return f"a term in {term.of} ({term.shape}{about}) in {equation}"

@@ -481,7 +481,7 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             limit = _JUMPING_STATE if isinstance(signal, State) else _JUMPING
             if len(np.unique(together)) < _LEVELS or (_jumps(together, limit) and not held):
                 continue
-            for terms in _terms(model.states[i].name, signal.name, together):
+            for terms in _terms(model.states[i].name, signal, together):
                 yield of_terms(runs, i, partial(_signal, j), terms, held=held)
 
 
@@ -507,25 +507,28 @@ def _term_along(
     return 0.5 * (values + np.append(values[:1], values[:-1])) if held else values
 
 
-def _terms(equation: str, of: str, signal: FloatArray) -> Iterator[tuple[AddedTerm, ...]]:
-    """Functions of a signal that are tested together.
+def _terms(
+    equation: str, signal: State | Input, values: FloatArray
+) -> Iterator[tuple[AddedTerm, ...]]:
+    """Functions of a signal that are tested together; values: its own over all records.
 
     A straight line by itself; shapes that together are like most, an even one among them; more
     friction near standstill.
     """
-    low, high = float(signal.min()), float(signal.max())
+    low, high = float(values.min()), float(values.max())
     centre = 0.0 if low < 0.0 < high else 0.5 * (low + high)
     size = max(high - centre, centre - low)
 
     def term(shape: Shape, part: float = 1.0) -> AddedTerm:
-        return AddedTerm(equation, of, shape, _short(part * size), -1.0, 1.0, _short(centre))
+        scale, middle = _short(part * size), _short(centre)
+        return AddedTerm(equation, signal.name, shape, scale, -1.0, 1.0, middle, signal.unit)
 
     if size == 0.0:
         return
     yield (term("linear"),)
     even = term("abs") if centre == 0.0 else term("parabola")
     yield term("sign", _STICTION), term("square"), term("cube"), even
-    if of == equation and centre == 0.0:
+    if signal.name == equation and centre == 0.0:
         yield tuple(term("stribeck", part) for part in _STANDSTILL)
 
 

@@ -23,6 +23,7 @@ class AddedTerm:
     abs(z) < 1), ``linear``, ``square`` (z abs(z)), ``cube``, ``abs``, ``parabola`` (z^2),
     ``sine`` or ``stribeck`` (sign(z) exp(-z^2)).
     scale, centre: in the signal's unit. low, high: range of the parameter, in the unit of the rate.
+    unit: the signal's, for sentences.
 
     >>> AddedTerm("omega", of="omega", shape="sign", scale=0.05, low=-500.0, high=500.0).parameter
     'sign_of_omega'
@@ -35,6 +36,7 @@ class AddedTerm:
     low: float
     high: float
     centre: float = 0.0
+    unit: str = ""
 
     @property
     def parameter(self) -> str:

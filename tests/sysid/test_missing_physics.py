@@ -170,7 +170,7 @@ def test_a_force_that_repeats_with_a_position_is_named_with_its_period(cogging):
     assert 2.0 * np.pi * sine.scale == pytest.approx(PITCH, rel=0.01)
     assert np.cos(0.7 + sine.centre / sine.scale) > 0.9
     assert verdict.parameters.trust != "good"
-    assert "that repeats with x (every 0.024), like cogging" in " ".join(verdict.reasons)
+    assert "that repeats with x (every 24 mm), like cogging" in " ".join(verdict.reasons)
 
 
 def on_a_spring(name, force, *parameters):
@@ -223,7 +223,7 @@ def test_cogging_of_a_motor_whose_model_has_no_angle_is_named_with_its_period(pu
     """Twelve times a turn, a sixtieth of the torque: it had been called good with J off."""
     plant = Plant(lambda omega, angle: pull * math.sin(12.0 * angle))
     outcome = tried(replace(CASES["cogging"], plant=plant, logs=logs), 1)
-    named = "repeats with the integral of omega (every 0.524), like cogging"
+    named = "repeats with the integral of omega (every 0.524 rad), like cogging"
     said = " ".join((*outcome.verdict.parameters.reasons, *outcome.verdict.notes))
     assert (named in said) == (pull > 0.0)
     assert (outcome.verdict.parameters.trust == "good") == (not pull or not outcome.moved)
