@@ -19,6 +19,7 @@ from daq.designs.result import DesignResult
 from daq.designs.runs import progress_of, write_runs
 from daq.designs.setup import Setup, set_up, set_up_structures
 from daq.documents import plain
+from daq.errors import ConfigError
 from daq.files import write_whole
 from daq.identification.fit import check_writable
 from daq.progress import Note, Watch, ignore
@@ -69,10 +70,10 @@ def design_files(
     folder = out or Path("designs") / _stamp()
     if file.content.get("structures"):
         setups = set_up_structures(file, watch)
-        check_writable(folder)
+        _check_new(folder)
         return discrimination.write(setups, discrimination.choose(setups, watch), folder)
     setup = set_up(file, watch)
-    check_writable(folder)
+    _check_new(folder)
     return write(setup, choose(setup, watch), folder, commands_of(setup, folder))
 
 
@@ -147,6 +148,13 @@ def write(
     draw_design(result, setup.rig)
     write_whole(folder / DATA, json.dumps(plain(result.document), indent=1) + "\n")
     return result
+
+
+def _check_new(folder: Path) -> None:
+    """Raise ConfigError, before a long search, where no design can be written or there is one."""
+    check_writable(folder)
+    if (folder / DATA).exists() or any(folder.glob("designed-*.yaml")):
+        raise ConfigError("a design is there", cure="choose another with --out", file=folder)
 
 
 def _stamp() -> str:

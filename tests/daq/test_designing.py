@@ -301,11 +301,11 @@ def test_what_is_printed_as_equal_is_met_and_what_is_narrowed_is_not_unknown(ask
     exact = {q["name"]: 100.0 * q["after"] for q in json.loads(first.stdout)["quantities"]}
     # Wanted: of K_m so little more than will be had that both print alike, of R_m far more.
     equal, finer = float(f"{exact['K_m']:.2g}"), 0.2 * exact["R_m"]
-    for k_m in (equal, equal / 1.001):
+    for out, k_m in (("e", equal), ("f", equal / 1.001)):
         targets = ["--set", f"targets.K_m={k_m}", "--set", f"targets.R_m={finer}"]
         once = ["--set", "time=1.25 s", *targets]
-        done = rig("design", asked, *once, "--out", "e", cwd=tmp_path)
-        document = json.loads((tmp_path / "e" / "design.json").read_text("utf-8"))
+        done = rig("design", asked, *once, "--out", out, cwd=tmp_path)
+        document = json.loads((tmp_path / out / "design.json").read_text("utf-8"))
         quantities = {q["name"]: q for q in document["quantities"]}
         for name, wanted in (("K_m", k_m), ("R_m", finer)):
             after = float(f"{100.0 * quantities[name]['after']:.2g}")
@@ -342,6 +342,16 @@ def test_a_design_that_limits_stop_says_how_to_go_on(asked, tmp_path):
     assert done.returncode == 1
     rest = "rig run d/designed-1.yaml d/designed-2.yaml --rig slow.yaml --out r"
     assert f"0 of 2 runs were completed; go on with: {rest}" in done.stderr
+
+
+def test_a_design_is_not_written_over(asked, tmp_path):
+    experiment = tmp_path / "d" / "designed-1.yaml"
+    experiment.parent.mkdir()
+    experiment.write_text("# mine\n")
+    done = rig("design", asked, "--out", "d", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.endswith("d: a design is there; choose another with --out\n")
+    assert experiment.read_text() == "# mine\n" and len(list(experiment.parent.iterdir())) == 1
 
 
 def test_a_folder_without_a_design_is_refused(tmp_path):
