@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,6 +29,7 @@ from sysid import campaign as run_campaign
 
 _SEEDS_HELP = "write 0:10 for the seeds 0 to 9, or 3,5,8"
 _WRITE_EVERY = 2.0  # s
+_TRACKER = "ignore::UserWarning:joblib.externals.loky.backend.resource_tracker"
 CONNECT_TIMEOUT = 10.0  # s to wait for a scheduler's answer
 
 
@@ -45,12 +47,31 @@ class Workers:
             cure = "give 1 or more, -1 for all cores"
             raise ConfigError("0 runs at a time do nothing", cure=cure, key="--jobs")
         if self.dask is None:
-            yield -1 if self.jobs is None else self.jobs
+            with _tracker_unheard():
+                yield -1 if self.jobs is None else self.jobs
             return
         import joblib
 
         with _client(self.dask) as client, joblib.parallel_config(backend="dask", client=client):
             yield None
+
+
+@contextmanager
+def _tracker_unheard() -> Iterator[None]:
+    """Within it a tracker of joblib begins that says nothing of what a stopped program leaves.
+
+    It takes that away, which is its task; a process of its own, it hears of filters by the
+    environment alone.
+    """
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (before, _TRACKER)))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 @dataclass(frozen=True)

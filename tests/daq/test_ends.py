@@ -290,9 +290,7 @@ def children(pid):
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_workers_end_with_the_program_that_started_them(data, number):
     words = ("campaign", "log.csv", "--model", "model.py:lag", "--config", "id.yaml")
-    # joblib's tracker of temporary folders may warn of one that went while it was looking.
-    tracker = "joblib.externals.loky.backend.resource_tracker"
-    warned = {"PYTHONWARNINGS": f"error,ignore::UserWarning:{tracker}"}
+    warned = {"PYTHONWARNINGS": "error"}
     process = start_rig(*words, "--seeds", "0:4", "--jobs", 2, cwd=data, env=warned)
     ticks = os.sysconf("SC_CLK_TCK")
 
@@ -305,6 +303,7 @@ def test_workers_end_with_the_program_that_started_them(data, number):
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers), "their end", 20)
+    assert "resource_tracker" not in errors
     if number == signal.SIGTERM:
         assert process.returncode == 1 and "Traceback" not in errors
         assert "rig: 0 of 4 runs had been finished\nrig: stopped by SIGTERM" in errors
