@@ -290,7 +290,9 @@ def children(pid):
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_workers_end_with_the_program_that_started_them(data, number):
     words = ("campaign", "log.csv", "--model", "model.py:lag", "--config", "id.yaml")
-    warned = {"PYTHONWARNINGS": "error"}
+    # An error there, its tracker would swallow.
+    tracker = "joblib.externals.loky.backend.resource_tracker"
+    warned = {"PYTHONWARNINGS": f"error,default::UserWarning:{tracker}"}
     process = start_rig(*words, "--seeds", "0:4", "--jobs", 2, cwd=data, env=warned)
     ticks = os.sysconf("SC_CLK_TCK")
 
