@@ -16,7 +16,17 @@ import numpy as np
 
 from sysid import BatchSimulator, Dataset
 
-SYSTEMS = ("two_tanks", "oscillator", "aeropendulum", "air_vessel", "heater", "battery")
+SYSTEMS = (
+    "two_tanks",
+    "oscillator",
+    "aeropendulum",
+    "air_vessel",
+    "heater",
+    "battery",
+    "elastic_shaft",
+    "quarter_car",
+    "reactor",
+)
 HERE = Path(__file__).parent
 NOISE = 0.005  # of the largest output
 MARK = "<!-- made by make.py -->\n"
@@ -146,7 +156,7 @@ def main():
     }
     hits = []
     lines = ["| system | parameter | true | found | 95 % interval |", "|---|---|---|---|---|"]
-    figure, axes = plt.subplots(3, 3, figsize=(12.0, 7.5), layout="constrained")
+    figure, axes = plt.subplots(4, 3, figsize=(12.0, 10.0), layout="constrained")
     for axis, (name, (place, make)) in zip(axes.flat, cases.items(), strict=True):
         result, truth = make()
         rows, held = table_rows(f"[`{name}`]({place})", result, truth)

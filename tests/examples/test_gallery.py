@@ -11,7 +11,17 @@ from sysid import GASSI
 from tests.examples.conftest import EXAMPLES
 
 GALLERY = EXAMPLES / "gallery"
-SYSTEMS = ("two_tanks", "oscillator", "aeropendulum", "air_vessel", "heater", "battery")
+SYSTEMS = (
+    "two_tanks",
+    "oscillator",
+    "aeropendulum",
+    "air_vessel",
+    "heater",
+    "battery",
+    "elastic_shaft",
+    "quarter_car",
+    "reactor",
+)
 
 
 @pytest.fixture
