@@ -194,10 +194,11 @@ def _show(entry: RunEntry, folder: Path) -> None:
         if value:
             terminal.print_text(f"{key}: {value}")
     if entry.quantities:
-        rows = [
-            [row.name, row.text(row.value), _ends(row), row.unit, row.undetermined_label]
-            for row in entry.quantities
-        ]
+        rows = []
+        for row in entry.quantities:
+            scale, unit = row.engineering
+            ends = row.span(scale) if row.interval else ""
+            rows.append([row.name, row.text(row.value, scale), ends, unit, row.undetermined_label])
         head = ["name", "value", "95 % interval", "unit", "note"]
         terminal.print_table("Parameters", head, rows, text=["unit", "note"])
     else:

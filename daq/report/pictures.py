@@ -277,12 +277,11 @@ def _parameters(rows: Rows) -> Iterator[Picture]:
         if row.interval is not None and row.two_sided
     }
     if drawn:
-        left_out = f"{len(rows.starts)} start{'s' * (len(rows.starts) > 1)} of states in the logs"
         yield Picture(
             "intervals", "parameters",
             "95 % intervals of all that the data determine on both sides: parameters by "
             "themselves, and combinations of those that act only together."
-            f"{f' Of {left_out} the table has the intervals.' if rows.starts else ''}",
+            f"{' Those with starts of states in the logs are in the table.' * bool(rows.starts)}",
             intervals(list(drawn), np.array(list(drawn.values()))),
         )  # fmt: skip
     names = [row.name for row in rows.determined]

@@ -356,7 +356,7 @@ def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captur
     assert result.returncode == 0, result.stderr
     page = (root / "tied" / "report.html").read_text("utf-8")
     assert re.search(r'data-quantity="[^"]*z\(0\)', page)
-    assert "Of 1 start of states in the logs the table has the intervals." in page
+    assert "Those with starts of states in the logs are in the table." in page
     rows = Rows.of(json.loads((root / "tied" / "report.json").read_text("utf-8")))
     figure = next(p.figure for p in _parameters(rows) if p.name == "intervals")
     labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
