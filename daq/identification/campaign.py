@@ -204,9 +204,14 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
     table = _write_table(folder, result)
     by_key = {(group.model_name, group.name): group for group in groups}
     best, files = result.best(), {}
+
+    def report(done: int) -> None:
+        watch(Progress("Intervals", done, len(best), f"{done}/{len(best)} of the best runs"))
+
+    report(0)  # from when on it is timed
     for place, (key, outcome) in enumerate(best.items(), 1):
         files[key] = by_key[key].result(outcome).save(folder / f"best-{place}")
-        watch(Progress("Intervals", place, len(best), f"{place}/{len(best)} of the best runs"))
+        report(place)
     return CampaignResult(result, table, files)
 
 
@@ -257,6 +262,7 @@ def run_all(
         status = f"{finished}/{len(runs)} runs, {of_run}"
         watch(Progress("Identification", finished, len(runs), status))
 
+    watch(Progress("Identification", 0, len(runs), f"0/{len(runs)} runs"))
     with workers.ready() as jobs:
         try:
             result = run_campaign(runs, n_jobs=jobs, on_outcome=report)
