@@ -6,7 +6,7 @@ which the residuals' colour, the noise of the inputs, the sensors' zero errors a
 samples that runs start at enter (Ljung, "System Identification", sections 9.2 and 9.4).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +19,8 @@ from sysid.uncertainty.sensitivity import (
     averages_errors,
     bend_errors,
     input_noises,
-    noise_pushes,
     parabola_errors,
+    raised_noises,
     spans,
     start_errors,
     zero_errors,
@@ -107,12 +107,42 @@ def covariance(
     weight = sensitivity.objective.least_squares_weights(residual)
     weighted = slopes * weight[:, None]
     if score is None:
-        score = _score(sensitivity, weight, weighted)
-    rows = (slopes * np.sqrt(weight)[:, None]).reshape(-1, slopes.shape[2])
-    sizes = np.linalg.norm(rows, axis=0)
-    moving = sizes > _ROUNDING**2 * np.max(
-        sizes * spans(sensitivity.objective, sensitivity.chromosome)
+        score = _score(sensitivity, weight, weighted, ties)
+    felt = _felt(sensitivity, weight, ties, held)
+    inverse = felt.back @ felt.back.T
+    return Covariance(
+        ties,
+        score,
+        inverse @ score @ inverse,
+        inverse,
+        _foretold(sensitivity, weight, felt),
+        felt.flat,
+        felt.sizes,
+        felt.singular_values,
+        spread(sensitivity, weighted, felt.back, score),
     )
+
+
+@dataclass(frozen=True)
+class _Felt:
+    """Directions that the outputs feel; back: (n_free, rank), in them the curvature is one.
+
+    The others as of ``Covariance``.
+    """
+
+    back: FloatArray
+    flat: FloatArray
+    sizes: FloatArray
+    singular_values: FloatArray
+
+
+def _felt(
+    local: Sensitivity, weight: FloatArray, ties: FloatArray, held: BoolArray | None = None
+) -> _Felt:
+    """Those that move the outputs, as they weigh, across the ties and without what is held."""
+    rows = (local.slopes * np.sqrt(weight)[:, None]).reshape(-1, local.slopes.shape[2])
+    sizes = np.linalg.norm(rows, axis=0)
+    moving = sizes > _ROUNDING**2 * np.max(sizes * spans(local.objective, local.chromosome))
     sizes = np.where(moving if held is None else moving & ~held, sizes, 0.0)
     basis = _complement(ties, sizes)
     scaled = np.divide(rows, sizes, out=np.zeros_like(rows), where=sizes > 0.0)
@@ -120,21 +150,19 @@ def covariance(
     felt = values > _ROUNDING * values[0] if len(values) else np.zeros(0, dtype=bool)
     back = basis @ (axes[felt].T / values[felt])
     back = np.divide(back, sizes[:, None], out=np.zeros_like(back), where=sizes[:, None] > 0.0)
-    inverse = back @ back.T
-    return Covariance(
-        ties,
-        score,
-        inverse @ score @ inverse,
-        inverse,
-        -inverse @ np.einsum("tip,ti->p", weighted, residual),
-        axes[~felt] @ basis.T,
-        sizes,
-        values,
-        spread(sensitivity, weighted, back, score),
-    )
+    return _Felt(back, axes[~felt] @ basis.T, sizes, values)
 
 
-def _score(sensitivity: Sensitivity, weight: FloatArray, weighted: FloatArray) -> FloatArray:
+def _foretold(local: Sensitivity, weight: FloatArray, felt: _Felt) -> FloatArray:
+    """Step (n_free,) to the minimum that slopes foretell."""
+    score = np.einsum("tip,ti,i->p", local.slopes, local.residual, weight)
+    step: FloatArray = -felt.back @ (felt.back.T @ score)
+    return step
+
+
+def _score(
+    sensitivity: Sensitivity, weight: FloatArray, weighted: FloatArray, ties: FloatArray
+) -> FloatArray:
     """Covariance of the score by all noise, (n_free, n_free); weighted: slopes times weights."""
     residual = sensitivity.residual
     noise = colour(residual, sensitivity.seen, sensitivity.lengths)
@@ -145,9 +173,27 @@ def _score(sensitivity: Sensitivity, weight: FloatArray, weighted: FloatArray) -
     constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
     for errors in (*constant, averages_errors(sensitivity), bend_errors(sensitivity)):
         score += _score_covariance_by(weighted, errors)
-    pushes = np.array([*noise_pushes(sensitivity, weight)]).reshape(-1, weighted.shape[2])
+    pushes = np.array([*noise_pushes(sensitivity, weight, ties)])
+    pushes = pushes.reshape(-1, weighted.shape[2])
     score += pushes.T @ pushes
     return score
+
+
+def noise_pushes(local: Sensitivity, weight: FloatArray, ties: FloatArray) -> Iterator[FloatArray]:
+    """Changes (n_free,) of a filter's score by a standard deviation of each output's noise.
+
+    Those that move the estimate as far as the minima that slopes foretell lie apart. A filter that
+    corrects itself jumps at kinks: a single slope there may outweigh a score, and hardly moves a
+    minimum.
+    """
+    raised = [*raised_noises(local, weight)]
+    if not raised:
+        return
+    curvature = np.einsum("tip,tir,i->pr", local.slopes, local.slopes, weight, optimize=True)
+    minimum = _foretold(local, weight, _felt(local, weight, ties))
+    for moved, weights, share in raised:
+        there = _foretold(moved, weights, _felt(moved, weights, ties))
+        yield curvature @ (minimum - there) * share
 
 
 def _complement(ties: FloatArray, sizes: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ _FILTER_PERTURBATION = 1e-6  # the same where kinks make a filter jump: fewer li
 # Part of the larger slopes by which those of both sides differ where there is a kink between them,
 # and how many times as far one looks then which of them a jump has made.
 _KINK, _FARTHER = 0.01, 100.0
+_JUMP = 10.0  # times that a slope is larger by the shorter distance, from where on it is a jump
 # Realisations of the inputs' noise in all records together, and the fewest of one record: they
 # give a variance to within 12 % and 25 %.
 _DRAWS, _FEWEST_DRAWS = 128, 32
@@ -29,6 +30,7 @@ _RAISED = 0.02 * 4.0 ** np.arange(12)
 _CHANCE_OF_SHOWN = 3.0  # deviations times the root of the samples of a variance by differences
 _SMALL = 0.1  # part of that noise to which a filter answers in proportion, kinks aside
 _TINY = 1e-300
+_IDLE = 1e-9  # of products of slopes: below this share of the largest they are rounding
 # Times what the accuracy allows, that a simulation may err by to be compared with another.
 _COMPARABLE = 10.0
 
@@ -144,12 +146,13 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     slopes = (changes[..., :n] - changes[..., n:]) / (np.maximum(sides, 1) * distance)
     if corrects:
         near = np.stack([changes[..., :n], -changes[..., n:]]) / distance
-        kinks = np.flatnonzero(_kinks(*near) & (sides == 2))
-        moves = _FARTHER * shift[kinks]
+        # Next to kinks the chromosome itself may lie on one, where both sides jump alike.
+        two = np.flatnonzero((sides == 2) & _kinks(*near)[sides == 2].any())
+        moves = _FARTHER * shift[two]
         around = objective.space.decode(np.concatenate([at + moves, at - moves]))
         ahead, behind = np.split(objective.residuals(around, steps).values - centre, 2, axis=-1)
-        far = np.stack([ahead, -behind]) / (_FARTHER * distance[kinks])
-        slopes[..., kinks] = _without_jumps(near[..., kinks], far)
+        far = np.stack([ahead, -behind]) / (_FARTHER * distance[two])
+        slopes[..., two] = _without_jumps(near[..., two], far)
     seen = np.concatenate([np.isfinite(record.outputs) for record in objective.records])
     factors = np.broadcast_to(share, seen.shape)
     residual, slopes = factors * centre[..., 0], factors[..., None] * slopes
@@ -197,13 +200,16 @@ def _without_jumps(near: FloatArray, far: FloatArray) -> FloatArray:
     """Slopes by differences over a distance and over a longer one, each (2, ...) on both sides.
 
     A jump is seen as a slope that goes with the distance's inverse. Where both sides agree least
-    badly their mean counts, else the side on which both distances agree better.
+    badly their mean counts, else the side on which both distances agree better; where both jump,
+    the longer distance.
     """
     (ahead, behind), unsteady = near, np.abs(near - far)
     unsteady = np.where(np.isfinite(unsteady), unsteady, np.inf)
     side = np.where(unsteady[0] <= unsteady[1], ahead, behind)
-    mean = 0.5 * (ahead + behind)
+    mean, farther = 0.5 * (ahead + behind), 0.5 * (far[0] + far[1])
     slopes: FloatArray = np.where(np.abs(ahead - behind) <= unsteady.min(axis=0), mean, side)
+    jumps = _JUMP * np.abs(far).max(axis=0) < np.abs(near).min(axis=0)
+    slopes[jumps] = farther[jumps]
     return slopes
 
 
@@ -319,14 +325,42 @@ def parabola_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
     yield change
 
 
-def bend_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
+def bend_errors(local: Sensitivity) -> Iterator[FloatArray]:
     """Change (n_residuals, n_outputs) of a filter's innovations by equations that noise bends.
 
-    Its mean over draws of that noise, which acts in one way on all samples alike.
+    Its mean over draws of that noise, which acts in one way on all samples alike, times how much
+    of it there may be: what no parameter takes up of it is seen in the residuals, or is missing
+    there, as after a turn that some draws take and the data did not. share: how much is seen; of
+    draws that differ the products of two tell how well it would be.
     """
-    if len(sensitivity.bends):
-        mean = sensitivity.bends.mean(axis=0)
-        yield np.where(np.isfinite(mean), mean, 0.0)
+    bends = np.where(np.isfinite(local.bends), local.bends, 0.0)
+    if not len(bends):
+        return
+    mean, errors = bends.mean(axis=0), _of_deviation(local.residual, local)
+    across = _across(local, np.array([_of_deviation(bend, local) for bend in bends]))
+    seen, n = across.mean(axis=0), len(bends)
+    products = (n * np.sum(seen**2) - np.mean(np.sum(across**2, axis=(1, 2)))) / (n - 1)
+    share = np.sum(seen * errors) / (1.0 + np.sum(seen**2))
+    yield mean * min(1.0, float(np.hypot(share, 1.0 / np.sqrt(1.0 + max(products, 0.0)))))
+
+
+def _of_deviation(errors: FloatArray, local: Sensitivity) -> FloatArray:
+    """Errors (n_residuals, n_outputs) in deviations of what is left of each output."""
+    left: FloatArray = np.sqrt(
+        np.sum(local.residual**2, axis=0) / np.maximum(local.criterion.counts, 1)
+    )
+    return np.divide(errors, left, out=np.zeros_like(errors), where=left > 0.0)
+
+
+def _across(local: Sensitivity, errors: FloatArray) -> FloatArray:
+    """What no parameters make of errors (n, n_residuals, n_outputs), in deviations."""
+    slopes = np.moveaxis(local.slopes, 2, 0)
+    rows = np.array([_of_deviation(column, local).ravel() for column in slopes])
+    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), _TINY)
+    columns = errors.reshape(len(errors), -1)
+    inverse = np.linalg.pinv(rows @ rows.T, _IDLE, hermitian=True)
+    across: FloatArray = columns - columns @ rows.T @ inverse @ rows
+    return across.reshape(errors.shape)
 
 
 def averages_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
@@ -349,17 +383,18 @@ def averages_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
             yield _change_by_record(sensitivity, k, moved) / (_SMALL * np.sqrt(_FEWEST_DRAWS))
 
 
-def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]:
-    """Changes (n_free,) of a filter's score by a standard deviation of each output's noise.
+def raised_noises(
+    local: Sensitivity, weight: FloatArray
+) -> Iterator[tuple[Sensitivity, FloatArray, float]]:
+    """Filters by more noise of an output each, and a standard deviation of it in parts of that.
 
     The noise is such that the innovations' mean square is what the filter expects, which chance
     moves; where noise of the inputs does most of it, it is hardly known. weight: (n_outputs,), of
-    the squares.
+    the squares; the filters have theirs, as weights follow the errors.
     """
     fitted, residual = local.criterion, local.residual
     if not filters(fitted):
         return
-    score = np.einsum("tip,ti,i->p", local.slopes, residual, weight)
     for j in np.flatnonzero((fitted.weights > 0.0) & (fitted.counts > 1)):
         squares = residual[local.seen[:, j], j] ** 2
         if not squares.any():  # an output that never errs
@@ -378,14 +413,12 @@ def noise_pushes(local: Sensitivity, weight: FloatArray) -> Iterator[FloatArray]
         if not (np.isfinite(fall) and fall > 0.0):
             continue
         moved = sensitivity(raised_filter, local.chromosome)
-        # As weights follow the errors.
         sizes = np.sum(residual**2, axis=0) / np.maximum(np.sum(moved.residual**2, axis=0), _TINY)
-        onward = np.einsum("tip,ti,i->p", moved.slopes, moved.residual, weight * sizes)
         # It is between nothing and what the output's samples show, or known by these.
         shown, is_white = fitted.shown_noise
         most = _CHANCE_OF_SHOWN / np.sqrt(fitted.counts[j]) if is_white[j] else 1.0
         raises = min(deviation / fall, most * float(shown[j] / fitted.noise[j]) ** 2 / raised)
-        yield (onward - score) * raises * _of_positive(1.0 / (raises * raised))
+        yield moved, weight * sizes, raises * _of_positive(1.0 / (raises * raised))
 
 
 def _of_positive(mean: float) -> float:

@@ -33,7 +33,8 @@ from sysid.gassi.noise_fit import NoiseFit, towards
 from sysid.gassi.optima import Optimum
 from sysid.judging.examination import suspected, verdict_of
 from sysid.uncertainty import uncertainty
-from sysid.uncertainty.sensitivity import sensitivity
+from sysid.uncertainty.covariance import noise_pushes
+from sysid.uncertainty.sensitivity import bend_errors, raised_noises, sensitivity
 from tests.sysid.support import lag, linear_response, prbs
 
 DT, TAU, GAIN = 0.02, 0.05, 2.0
@@ -770,6 +771,65 @@ def test_where_a_filter_jumps_on_both_sides_each_residual_has_its_own():
     slopes = sensitivity(corrected, at).slopes
     size = corrected.residuals(at[None], [8]).values.max()
     assert np.abs(slopes[..., 1]).max() < 10.0 * size
+
+
+def test_where_a_filter_stands_on_a_jump_slopes_are_not_the_jump():
+    """In a narrow band about the kink nothing pulls, above it inwards and below it outwards."""
+    model = ProcessModel(
+        name="banded",
+        states=(State("y", "1", initial=1.0, first_sample=False),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("y", "1"),),
+        parameters=(
+            Parameter("rate", "1/s", 5.0, 0.5, 50.0, "log"),
+            Parameter("kink", "1", 1.0, 0.1, 10.0, "log"),
+        ),
+        derivative=lambda x, u, p: (
+            u[0] - p[0] * (max(x[0] - p[1] - 1e-8, 0.0) + max(p[1] - 1e-8 - x[0], 0.0)),
+        ),
+    )
+    y = 1.0 + 0.1 * np.random.default_rng(0).standard_normal(60)
+    record = Dataset(np.zeros(60), y, DT, input_noise=np.array([1.0]))
+    at = np.array([5.0, 1.0])
+    objective = Objective(BatchSimulator(model), SearchSpace.of(model), [record])
+    corrected = Innovations.of(objective, np.array([0.1]), corrects=True)
+    slopes = sensitivity(corrected, at).slopes[:, 0]
+    size = corrected.residuals(at[None], [8]).values.max()
+    assert np.abs(slopes[:, 1]).max() < 20.0 * size
+
+
+def test_what_a_filters_noise_may_move_is_how_far_apart_its_minima_lie():
+    (record, _) = noisy_records(1)
+    objective = Objective(BatchSimulator(lag(), accuracy=1e-4), SearchSpace.of(lag()), [record])
+    fit = NoiseFit(objective, objective, corrects=True)(np.array([GAIN, TAU]))
+    local = sensitivity(fit.objective, fit.chromosome)
+    weight = local.objective.least_squares_weights(local.residual)
+    ((moved, weights, share),) = raised_noises(local, weight)
+    (push,) = noise_pushes(local, weight, np.zeros((0, 2)))
+    curvature = np.einsum("tip,tir,i->pr", local.slopes, local.slopes, weight)
+    there = refine(moved.criterion, fit.chromosome).chromosome
+    apart = np.log(there / fit.chromosome)
+    assert np.linalg.solve(curvature, -push / share) == pytest.approx(apart, rel=0.15, abs=1e-3)
+    assert weights.shape == (1,) and np.abs(apart).max() > 1e-3
+
+
+@pytest.mark.parametrize("there", [0.0, 1.0])
+def test_of_a_bend_counts_what_residuals_do_not_deny(there):
+    """A turn that noise may bring, which no parameter could hide."""
+    (record, _) = noisy_records(1)
+    objective = Objective(BatchSimulator(lag(), accuracy=1e-4), SearchSpace.of(lag()), [record])
+    fit = NoiseFit(objective, objective, corrects=True)(np.array([GAIN, TAU]))
+    local = sensitivity(fit.objective, fit.chromosome)
+    turn = np.zeros_like(local.residual)
+    turn[200:260] = 6.0 * local.residual.std()
+    local = replace(local, residual=local.residual + there * turn)
+    vars(local)["bends"] = np.stack([turn, turn, turn, turn])
+    (change,) = bend_errors(local)
+    assert np.abs(change).max() == pytest.approx(there * turn.max(), abs=0.1 * turn.max())
+    # One that is too small to be seen counts as a whole.
+    vars(local)["bends"] = 1e-3 * vars(local)["bends"]
+    (change,) = bend_errors(local)
+    assert np.abs(change).max() == pytest.approx(1e-3 * turn.max(), rel=0.01)
 
 
 def test_little_noise_of_an_output_is_found_beside_what_that_of_an_input_does():
