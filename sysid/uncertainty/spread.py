@@ -1,8 +1,8 @@
 """How much the estimates of single logs differ, where that is more than their noise lets them.
 
 Of a model that is not quite right every log wants parameters of its own, and no colour of the
-residuals tells by how much. The spread of what is estimated without each log in turn does (the
-infinitesimal jackknife by clusters; Bell & McCaffrey, "Bias reduction in standard errors for
+residuals tells by how much. The spread of what each log pulls the estimate by does (variances by
+clusters; Bell & McCaffrey, "Bias reduction in standard errors for
 linear regression with multi-stage samples", Survey Methodology 28, 2002). It counts where
 Cochran's test finds the logs to disagree ("The combination of estimates from different
 experiments", Biometrics 10, 1954). Less than that, and what too few logs inform, is widened by
@@ -36,9 +36,10 @@ _APART = 0.01  # of quantities that differ no more than all do, those whose own 
 
 @dataclass(frozen=True)
 class LogSpread:
-    """Estimates without one log each, as they differ from that of all.
+    """What each log moves the estimate of all by.
 
-    influence: (n_logs, n_free), in search coordinates. information: (n_logs, n_free, n_free),
+    influence: (n_logs, n_free), in search coordinates, such that its squares sum to the variance
+    on average if logs differ by noise alone. information: (n_logs, n_free, n_free),
     parts of the covariance that each log's share of the curvature stands for. ratio: the spread's
     variance in parts of what noise makes, of so many degrees of freedom. at_odds: whether it is
     more than chance.
@@ -98,17 +99,14 @@ def spread(
     noise, axes = np.linalg.eigh(back.T @ score @ back)
     back = back @ axes
     moves, leverages = np.empty((len(lengths), rank)), np.empty((len(lengths), rank, rank))
-    parts = np.empty_like(moves)
     for k, rows in enumerate(record_rows(lengths)):
         part = weighted[rows]
         push = np.einsum("tip,ti->p", part, sensitivity.residual[rows])
         leverages[k] = back.T @ np.einsum("tip,tir->pr", part, sensitivity.slopes[rows],
                                           optimize=True) @ back  # fmt: skip
-        moves[k] = _without(leverages[k], back.T @ push, 1.0)
-        parts[k] = _without(leverages[k], back.T @ push, 0.5)
+        moves[k] = _moved(leverages[k], back.T @ push)
     freedom = np.array([_freedom(shares) for shares in np.diagonal(leverages, axis1=1, axis2=2).T])
-    # The jackknife's own variance is too large on average where some logs tell most.
-    ratios = np.sum(parts**2, axis=0) / np.maximum(noise, 1e-12 * noise[-1])
+    ratios = np.sum(moves**2, axis=0) / np.maximum(noise, 1e-12 * noise[-1])
     chance = float(special.chdtrc(freedom.sum(), freedom @ ratios))
     at_odds = chance <= (_CHANCE if logs else _CHANCE_OF_PARTS)
     if not at_odds and (not logs or chance > _MODEST):
@@ -118,14 +116,16 @@ def spread(
     return LogSpread(moves @ back.T, information, ratio, total, at_odds)
 
 
-def _without(leverage: FloatArray, push: FloatArray, power: float) -> FloatArray:
-    """Move of the estimate without a log, by its leverage (rank, rank) and its score (rank,).
+def _moved(leverage: FloatArray, push: FloatArray) -> FloatArray:
+    """Move of the estimate by a log, of its leverage (rank, rank) and its score (rank,).
 
-    power: 1 for the move itself; 1/2 for one whose squares, summed over the logs, have the
-    estimate's variance as their mean (Bell & McCaffrey's second correction).
+    The squares, summed over the logs, have the estimate's variance as their mean (Bell &
+    McCaffrey's correction by the root of what is left without the log). By what leaving the log out
+    would move, as the jackknife has it, a quantity that one log tells nearly alone would err a
+    hundred times as much as it does.
     """
     share, axes = linalg.eigh(leverage)
-    left = np.where(share < _ALONE, np.abs(1.0 - share) ** power, np.inf)
+    left = np.where(share < _ALONE, np.sqrt(np.abs(1.0 - share)), np.inf)
     moved: FloatArray = axes @ ((axes.T @ push) / left)
     return moved
 

@@ -1152,6 +1152,22 @@ def test_logs_that_disagree_widen_to_the_spread_between_them():
     assert b.std == pytest.approx(quantile * expected, rel=0.15)
 
 
+@pytest.mark.parametrize("seed", [5, 6])
+def test_what_one_log_tells_nearly_alone_is_as_good_as_that_log(seed):
+    """Not as what is left without it, where the logs disagree of something else."""
+    slopes, sizes = [1.993, 2.003, 1.997, 2.01, 2.0, 1.99, 2.007, 2.0], [1.0, *[0.09] * 7]
+    rng, records = np.random.default_rng(seed), []
+    for slope, size in zip(slopes, sizes, strict=True):
+        u = rng.standard_normal((200, 2)) * [1.0, size]
+        y = slope * u[:, 0] + u[:, 1] + 0.05 * rng.standard_normal(200)
+        records.append(Dataset(u, y, 0.01))
+    result = slopes_problem().tell(records=records)
+    b = estimates(result)["b"]
+    alone = 0.05 / np.sqrt(np.sum(records[0].inputs[:, 1] ** 2))
+    assert result.disagreement > 2.0
+    assert alone < b.std < 6.0 * alone
+
+
 def coverage_of_few(spread, n_logs, repeats=100):
     """Share of intervals of a and b that hold their means, where those of logs spread so."""
     rng, held = np.random.default_rng(1), []
