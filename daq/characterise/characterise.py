@@ -275,8 +275,6 @@ def _question(
         "parameters": None if last is None else str(last.identification),
         "log": None if last is None else str(_logs(done)[-1]),
         "time": seconds,
-        "precision": request.precision,
-        "criterion": "balanced",
         "seed": len(done),
     }
     given = {key: value for key, value in options.items() if value is not None}

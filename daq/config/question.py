@@ -38,10 +38,9 @@ class Question(Section):
     precision: Percent | None = Field(
         None, gt=0.0, le=1000.0, description="the same for all that experiments can tell"
     )
-    criterion: Literal["D", "A", "E", "balanced"] = Field(
+    criterion: Literal["D", "A", "E"] = Field(
         "D",
-        description="without targets: information of all (D), mean variance (A), worst one (E); "
-        "balanced: intervals beyond the targets, without these beyond 10 %, count five times",
+        description="without targets: information of all (D), mean variance (A), worst one (E)",
     )
     structures: dict[str, list[str | bool | Part]] | list[str] | None = Field(
         None,
