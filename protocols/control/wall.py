@@ -62,7 +62,9 @@ class Body(Section):
     """What is physical, for the passivity bound and the stability to compare with."""
 
     inertia: Annotated[float, Unit("kg*m^2")] = Field(gt=0.0, description="of all that turns")
-    damping: Damping = Field(ge=0.0, description="of motor and brake, b in (1.1)")
+    damping: Damping = Field(
+        ge=0.0, description="of motor and brake: b in (1.1), b > K T / 2 + |B|"
+    )
     brake_damping: Annotated[float, Unit("N*m*s/(rad*V)")] = Field(
         0.0, ge=0.0, description="what each volt at the brake adds, for b_passive in (1.2)"
     )
