@@ -2,12 +2,12 @@
 
 Of a model that is not quite right every log wants parameters of its own, and no colour of the
 residuals tells by how much. The spread of what each log pulls the estimate by does (variances by
-clusters; Bell & McCaffrey, "Bias reduction in standard errors for
-linear regression with multi-stage samples", Survey Methodology 28, 2002). It counts where
-Cochran's test finds the logs to disagree ("The combination of estimates from different
-experiments", Biometrics 10, 1954). Less than that, and what too few logs inform, is widened by
-what all quantities show together (Birge, "The calculation of errors by the method of least
-squares", Physical Review 40, 1932). A single log is cut into parts.
+clusters; Bell & McCaffrey, "Bias reduction in standard errors for linear regression with
+multi-stage samples", Survey Methodology 28, 2002). It counts where Cochran's test finds the logs to
+disagree ("The combination of estimates from different experiments", Biometrics 10, 1954). Less
+than that, and what too few logs inform, is widened by what all quantities show together (Birge,
+"The calculation of errors by the method of least squares", Physical Review 40, 1932). A single log
+is cut into parts.
 """
 
 from __future__ import annotations
