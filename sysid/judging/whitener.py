@@ -1,6 +1,7 @@
 """Residuals and changes of the outputs, whitened by the residuals' autoregression."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
@@ -10,6 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from sysid.arrays import BoolArray, FloatArray
 from sysid.uncertainty.colour import Autoregression, colour, longest_memory, record_rows
 from sysid.uncertainty.sensitivity import Sensitivity
+from sysid.uncertainty.slow_noise import SlowFilter
 
 _FORGETS = 20  # samples of a record that count as independent, from where its mean is no colour
 
@@ -18,13 +20,15 @@ _FORGETS = 20  # samples of a record that count as independent, from where its m
 class Whitener:
     """Takes the residuals' colour out of columns (n_residuals, n_outputs, k): (n_rows, k).
 
-    kept: rows whose past the autoregression knows. decorrelate: (n_outputs, n_outputs).
+    kept: rows whose past the autoregression knows. decorrelate: (n_outputs, n_outputs). filters: of
+    the outputs whose noise has a slow part, by their places.
     """
 
     model: Autoregression
     lengths: tuple[int, ...]
     kept: BoolArray
     decorrelate: FloatArray
+    filters: Mapping[int, SlowFilter] = field(default_factory=dict)
 
     @classmethod
     def of(cls, local: Sensitivity, residual: FloatArray) -> Self:
@@ -44,7 +48,8 @@ class Whitener:
             for k in range(1, order + 1):
                 kept[rows][k:] &= whole[rows][:-k]
             kept[rows][:order] = False
-        return cls(model, local.lengths, kept, (vectors * roots) @ vectors.T)
+        filters = model.filters(local.seen, local.lengths)
+        return cls(model, local.lengths, kept, (vectors * roots) @ vectors.T, filters)
 
     @classmethod
     def _of_innovations(cls, local: Sensitivity, residual: FloatArray) -> Self:
@@ -89,7 +94,10 @@ class Whitener:
         felt = columns.any(axis=(0, 1))
         whole = np.zeros((q * int(self.kept[rows].sum()), k))
         order = len(self.model.coefficients)
-        flat = np.ascontiguousarray(columns[..., felt]).reshape(len(columns) * q, -1)
+        fast = np.array(columns[..., felt], order="C")
+        for j, kalman in self.filters.items():
+            fast[:, j] = kalman.innovations(fast[:, j], rows)
+        flat = fast.reshape(len(columns) * q, -1)
         past = sliding_window_view(flat, (order + 1) * q, axis=0)[::q].swapaxes(1, 2)
         white: FloatArray = (self._filter @ past)[self.kept[rows][order:]]
         whole[:, felt] = white.reshape(len(whole), -1)
@@ -108,6 +116,8 @@ class Whitener:
         back = np.zeros_like(whole)
         for lag in range(order + 1):
             back[lag : lag + len(pieces)] += pieces[..., lag * q : (lag + 1) * q]
+        for j, kalman in self.filters.items():
+            back[..., j] = kalman.back(back[..., j], rows)
         flat: FloatArray = back.swapaxes(1, 2).reshape(len(kept) * q, -1)
         return flat
 

@@ -1,19 +1,21 @@
 """Covariance of a score whose residuals are coloured.
 
 The residuals are described by a vector autoregression, whose order the Schwarz criterion
-chooses. The sum over time of S_t' e_t, with e = H eps for the autoregression's response H and
-white eps, has the covariance (H' S)' cov(eps) (H' S); H' is the same recursion run backwards in
-time, so that nothing of the size of the record squared is ever formed.
+chooses, and where the same criterion asks for it by a slow part of each output, below what so few
+samples show (``slow_noise``). The sum over time of S_t' e_t, with e = H eps for the response H of
+both and white eps, has the covariance (H' S)' cov(eps) (H' S); H' is the same recursion run
+backwards in time, so that nothing of the size of the record squared is ever formed.
 """
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import lapack
 
 from sysid.arrays import BoolArray, FloatArray
+from sysid.uncertainty.slow_noise import SlowFilter, SlowNoise, first_rows, slow_noise
 
 _LARGEST_ORDER = 12
 _BY_CHANCE = 4.0  # standard deviations of a correlation, to which it may come by chance
@@ -22,14 +24,28 @@ SUCCESSIVE = 0.3  # correlation from which an innovation could be foreseen by th
 
 @dataclass(frozen=True)
 class Autoregression:
-    """e_t = sum_k A_k e_(t-k) + eps_t; coefficients: (order, q, q), noise: (q, q)."""
+    """x_t = sum_k A_k x_(t-k) + eps_t; coefficients: (order, q, q), noise: (q, q).
+
+    x: the residuals, of outputs with a slow part what a filter of that leaves of them. slow: that
+    part of each output, or none; empty where no output has any.
+    """
 
     coefficients: FloatArray
     noise: FloatArray
+    slow: tuple[SlowNoise | None, ...] = ()
+
+    def filters(self, seen: BoolArray, lengths: Sequence[int]) -> dict[int, SlowFilter]:
+        """Filters of the outputs with a slow part, by their places; seen: (n, q), as measured."""
+        begins = first_rows(lengths)
+        return {
+            j: SlowFilter.of(noise, seen[:, j], begins)
+            for j, noise in enumerate(self.slow)
+            if noise is not None
+        }
 
 
 def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Autoregression:
-    """Autoregression of residuals (n, q) of records of the given lengths, by least squares.
+    """Colour of residuals (n, q) of records of the given lengths.
 
     seen: (n, q), which samples were measured; only equations without a lost one count.
     """
@@ -39,6 +55,26 @@ def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Aut
         # Outputs that are never measured together: of each its own variance.
         variance = np.sum(residual**2, axis=0) / np.maximum(seen.sum(axis=0), 1)
         return Autoregression(np.zeros((0, q, q)), np.diag(variance))
+    plain, criterion = _autoregression(residual, whole, lengths)
+    order = _largest_order(whole, lengths, 1)
+    slow = tuple(slow_noise(e, s, lengths, order) for e, s in zip(residual.T, seen.T, strict=True))
+    if not order or not any(slow):
+        return plain
+    filtered, more = residual.copy(), 0.0
+    filters = Autoregression(plain.coefficients, plain.noise, slow).filters(seen, lengths)
+    for j, kalman in filters.items():
+        for rows in record_rows(lengths):
+            filtered[rows, j : j + 1] = kalman.innovations(residual[rows, j : j + 1], rows)
+        more += 2.0 * float(np.sum(np.log(kalman.sizes))) + 2.0 * np.log(len(residual))
+    beside, lower = _autoregression(filtered, whole, lengths)
+    return replace(beside, slow=slow) if lower + more < criterion else plain
+
+
+def _autoregression(
+    residual: FloatArray, whole: BoolArray, lengths: Sequence[int]
+) -> tuple[Autoregression, float]:
+    """That of residuals (n, q) by least squares, and its Schwarz criterion; whole: (n,) rows."""
+    q = residual.shape[1]
     largest = _largest_order(whole, lengths, q)
     y, past = _regression(residual, whole, lengths, largest)
     basis = np.linalg.qr(past)[0]
@@ -55,7 +91,7 @@ def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Aut
     solution = np.asarray(np.linalg.lstsq(past, y, rcond=None)[0], dtype=np.float64)
     noise = _covariance(y - past @ solution, best)
     coefficients = np.moveaxis(solution.reshape(best, q, q), 1, 2)
-    return Autoregression(_decaying(coefficients, len(y)), noise)
+    return Autoregression(_decaying(coefficients, len(y)), noise), float(lowest)
 
 
 def record_rows(lengths: Iterable[int]) -> list[slice]:
@@ -88,13 +124,19 @@ def successive_correlation(
 
 
 def score_covariance(
-    slopes: FloatArray, lengths: Sequence[int], model: Autoregression
+    slopes: FloatArray, seen: BoolArray, lengths: Sequence[int], model: Autoregression
 ) -> FloatArray:
-    """Covariance (p, p) of sum_t slopes_t' e_t; slopes: (n, q, p), record after record."""
+    """Covariance (p, p) of sum_t slopes_t' e_t; slopes: (n, q, p), record after record.
+
+    seen: (n, q), which samples were measured.
+    """
     p = slopes.shape[2]
-    total = np.zeros((p, p))
+    total, filters = np.zeros((p, p)), model.filters(seen, lengths)
     for rows in record_rows(lengths):
-        part = _response(slopes[rows], model)
+        part = slopes[rows].copy()
+        for j, kalman in filters.items():
+            part[:, j] = kalman.response(part[:, j], rows)
+        part = _response(part, model)
         total += np.einsum("tip,ij,tjr->pr", part, model.noise, part, optimize=True)
     return total
 
@@ -175,10 +217,11 @@ def longest_memory(model: Autoregression, variance: FloatArray) -> FloatArray:
     so many samples count as one.
     """
     q = len(model.noise)
+    slow = [1.0 if noise is None else noise.amplification for noise in model.slow] or np.ones(q)
     try:
         gain = np.linalg.inv(np.eye(q) - model.coefficients.sum(axis=0))
     except np.linalg.LinAlgError:  # a pole at exactly one
         return np.full(q, np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.diag(gain @ model.noise @ gain.T) / variance
+        ratio = slow * np.diag(gain @ model.noise @ gain.T) / variance
     return np.where(np.isfinite(ratio), np.maximum(ratio, 1.0), 1.0)

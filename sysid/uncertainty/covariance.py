@@ -166,7 +166,7 @@ def _score(
     """Covariance of the score by all noise, (n_free, n_free); weighted: slopes times weights."""
     residual = sensitivity.residual
     noise = colour(residual, sensitivity.seen, sensitivity.lengths)
-    score = score_covariance(weighted, sensitivity.lengths, noise)
+    score = score_covariance(weighted, sensitivity.seen, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
     starts = (change for _, change in start_errors(sensitivity))

@@ -78,7 +78,8 @@ def test_score_covariance_is_that_of_the_dense_residuals(coefficients, lengths):
                               for h, n in zip(responses, lengths, strict=True)))  # fmt: skip
     rows = slopes.reshape(-1, 4)
     expected = rows.T @ covariance @ rows
-    found = score_covariance(slopes, lengths, Autoregression(coefficients, noise))
+    model = Autoregression(coefficients, noise)
+    found = score_covariance(slopes, seen(len(slopes), q), lengths, model)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
@@ -88,7 +89,7 @@ def test_of_a_long_record_it_is_the_stationary_one():
     covariance = sigma**2 / (1.0 - a**2) * toeplitz(a ** np.arange(n))
     expected = slopes.T @ covariance @ slopes
     model = Autoregression(AR1, np.array([[sigma**2]]))
-    found = score_covariance(slopes[:, None, :], (n,), model)
+    found = score_covariance(slopes[:, None, :], seen(n), (n,), model)
     np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.02)
 
 
@@ -136,19 +137,19 @@ def test_residuals_that_grow_are_given_no_endless_memory():
     """Drift that ends with the record: least squares alone finds memory that grows without end."""
     residual = np.exp(0.02 * np.arange(2000))[:, None]
     found = colour(residual, seen(2000), (2000,))
-    covariance = score_covariance(np.ones((2000, 1, 1)), (2000,), found)
+    covariance = score_covariance(np.ones((2000, 1, 1)), seen(2000), (2000,), found)
     # No sum of these residuals exceeds as many of the largest.
     assert 0.0 < covariance[0, 0] <= (2000 * residual.max()) ** 2
     lone = colour(np.exp(0.5 * np.arange(500))[:, None], seen(500), (500,))
     assert len(lone.coefficients) > 0
-    assert np.isfinite(score_covariance(np.ones((500, 1, 1)), (500,), lone)).all()
+    assert np.isfinite(score_covariance(np.ones((500, 1, 1)), seen(500), (500,), lone)).all()
 
 
 def test_of_white_residuals_it_is_sigma_squared_s_s():
     rng = np.random.default_rng(3)
     residual = 0.2 * rng.standard_normal((500, 1))
     slopes = rng.standard_normal((500, 1, 3))
-    found = score_covariance(slopes, (300, 200), colour(residual, seen(500), (300, 200)))
+    found = score_covariance(slopes, seen(500), (300, 200), colour(residual, seen(500), (300, 200)))
     expected = np.mean(residual**2) * slopes[:, 0].T @ slopes[:, 0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
