@@ -54,7 +54,7 @@ class Regression:
             white, free, [whitening.rows_of(r) for r in record_rows(whitening.lengths)]
         )
         within, beyond = self._basis.split(target)
-        self._coefficients, self._residual = self._basis.solved(within[:, 0]), beyond[:, 0]
+        self.coefficients, self._residual = self._basis.solved(within[:, 0]), beyond[:, 0]
         self._noises = noises
         self.squares = float(self._residual[: self._n] @ self._residual[: self._n])
 
@@ -117,7 +117,7 @@ class Regression:
         return Regressed(
             self._log_p(*self._statistic(left, score, freedom)),
             whole,
-            self._coefficients + move,
+            self.coefficients + move,
             move,
             min(float(score @ score) / max(self.squares, 1e-300), 1.0),
         )

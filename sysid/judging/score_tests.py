@@ -23,6 +23,7 @@ from typing import Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.special import chdtrc
 
 from sysid.arrays import FloatArray
 from sysid.fitting.free_run import noiseless
@@ -50,6 +51,7 @@ from sysid.judging.whitener import Whitener
 from sysid.problem.terms import AddedTerm
 from sysid.threads import Workers
 from sysid.uncertainty import Estimate, Uncertainty
+from sysid.uncertainty.colour import colour
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
     sensitivity,
@@ -58,6 +60,7 @@ from sysid.uncertainty.sensitivity import (
 from sysid.uncertainty.ties import coded_gradient
 
 _LOG_CHANCE = np.log(1e-3)  # of the probability of a finding by chance, all tests together
+_LOG_SURE = np.log(1e-9)  # from where on it does not matter how small it is
 # Have no single amplitude.
 _SEVERAL = ("variant", "bend", "function", "curve", "disturbance", "rest")
 _SLOW = ("delay", "filter", "lag")
@@ -192,7 +195,7 @@ class _Tests:
         self._noises = [
             (rows, noise * weights[rows][..., None]) for rows, noise in background.noises
         ]
-        self._regression = self._coloured_by(self._residual)
+        self._recolour(self._residual)
 
     def of(self, uncertainty: Uncertainty) -> Self:
         """The same, before any suspect is admitted, of what has intervals."""
@@ -266,23 +269,23 @@ class _Tests:
                 for i in significant
                 if i != surest and suspects[i].acts_like(suspect) and not suspects[i].repeats
             ]
-            terms = self._terms(suspect, changes[surest], residual)
+            terms, alone = self._terms(suspect, changes[surest], residual)
             for i in alike:
-                terms += self._terms(suspects[i], changes[i], results[i][1])
+                terms += self._terms(suspects[i], changes[i], results[i][1])[0]
             # Of what shape a function is hardly shows, and decides what it moves.
             shapes = [
                 self._moved(changes[i], results[i][0])
                 for i in significant
                 if i != surest and suspects[i].shares_place(suspect)
             ]
-            moves = [self._moved(changes[surest], result), *shapes]
+            moves = [self._moved(changes[surest], result), *alone, *shapes]
             self.findings.append(self._finding(suspect, result, moves, logs[surest], terms))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
             self._free = np.concatenate([self._free, np.zeros(admitted.shape[2])])
             self._ends.append(len(self._free))
-            self._regression = self._coloured_by(residual)
+            self._recolour(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
 
     def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
@@ -363,7 +366,29 @@ class _Tests:
         second = self._coloured_by(residual).test(changes, suspect.one_sided)
         if second is None or second.log_p > first.log_p:
             return first, residual
-        return second, self._left(changes, second)
+        left = self._left(changes, second)
+        likely = self._log_likely(left, int(np.count_nonzero(second.amplitudes)))
+        if likely < _LOG_SURE:
+            return second, left
+        if likely > first.log_p:
+            return first, residual
+        return replace(second, log_p=max(second.log_p, likely)), left
+
+    def _log_likely(self, left: FloatArray, freedom: int) -> float:
+        """Logarithm of the probability that noise is by chance so much likelier without a suspect.
+
+        left: what that leaves. Each by its own colour, with lines and all: the suspect may be
+        what slow noise does in a record, and no slow noise is left of it then.
+        """
+        ratio = self._deviance - self._deviance_of(left)
+        chance = float(chdtrc(freedom, max(ratio, 0.0)))
+        return math.log(chance) if chance > 0.0 else -math.inf
+
+    def _deviance_of(self, residual: FloatArray) -> float:
+        """Minus twice the logarithm of the likelihood of residuals, by their colour."""
+        local = self._local
+        counted = local.seen & (local.objective.weights > 0.0)
+        return colour(np.where(counted, residual, 0.0), local.seen, local.lengths).deviance
 
     def _as_late(
         self, suspect: Suspect, result: Regressed, residual: FloatArray
@@ -441,31 +466,44 @@ class _Tests:
     def _left(self, changes: FloatArray, result: Regressed) -> FloatArray:
         return self._residual - self._columns @ result.coefficients - changes @ result.amplitudes
 
+    def _recolour(self, residual: FloatArray) -> None:
+        """Take the colour of what the columns leave, or leave nearly, for that of the noise."""
+        self._regression = self._coloured_by(residual)
+        rest = self._residual - self._columns @ self._regression.coefficients
+        self._deviance = self._deviance_of(rest)
+
     def _coloured_by(self, residual: FloatArray) -> Regression:
         whitening = Whitener.of(self._local, residual)
         return Regression(whitening, self._columns, self._free, self._residual, self._noises)
 
     def _terms(
         self, suspect: Suspect, changes: FloatArray, residual: FloatArray
-    ) -> list[AddedTerm]:
-        """Terms of a suspect that by themselves explain, the most first; residual: what all leave.
+    ) -> tuple[list[AddedTerm], list[FloatArray]]:
+        """Terms of a suspect that by themselves explain, the most first, and what each moves.
 
-        Those of which a step tells no more than that a fit may well end with them.
+        residual: what all leave. Those of which a step tells no more than that a fit may well end
+        with them.
         """
         regression = self._coloured_by(residual)
         if suspect.terms and suspect.terms[0].shape == "sine":
             both = regression.test(changes, False)
             first = suspect.terms[0]
-            return [first if both is None else _of_phase(first, both.amplitudes)]
+            return [first if both is None else _of_phase(first, both.amplitudes)], []
+        columns = [changes[..., [k]] for k in range(len(suspect.terms))]
+        tests = [regression.test(column, False) for column in columns]
         alone = [
-            (result.share, _with_reach(term, float(np.abs(result.amplitudes[0]))))
-            for k, term in enumerate(suspect.terms)
-            if (result := regression.test(changes[..., [k]], False)) is not None
+            (test, term, column)
+            for test, term, column in zip(tests, suspect.terms, columns, strict=False)
+            if test is not None
         ]
         if not alone:
-            return list(suspect.terms[:1])
-        alone.sort(key=lambda test: -test[0])
-        return [term for share, term in alone if share > _NEARLY * alone[0][0]]
+            return list(suspect.terms[:1]), []
+        alone.sort(key=lambda each: -each[0].share)
+        alone = [each for each in alone if each[0].share > _NEARLY * alone[0][0].share]
+        return (
+            [_with_reach(term, float(np.abs(test.amplitudes[0]))) for test, term, _ in alone],
+            [self._moved(column, test) for test, _, column in alone],
+        )
 
     def _moved(self, changes: FloatArray, result: Regressed) -> FloatArray:
         """By how much each estimate moves where a fit, by its own weights, has a suspect as well.

@@ -1,5 +1,6 @@
 """Residuals and changes of the outputs, whitened by the residuals' autoregression."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -9,11 +10,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.uncertainty.colour import Autoregression, colour, longest_memory, record_rows
+from sysid.uncertainty.colour import Autoregression, colour, record_rows
 from sysid.uncertainty.sensitivity import Sensitivity
 from sysid.uncertainty.slow_noise import SlowFilter
 
-_FORGETS = 20  # samples of a record that count as independent, from where its mean is no colour
+_OF_A_LINE = 2  # parameters
 
 
 @dataclass(frozen=True)
@@ -131,10 +132,10 @@ class Whitener:
 def colour_about_line(
     residual: FloatArray, seen: BoolArray, measured: BoolArray, lengths: tuple[int, ...]
 ) -> Autoregression:
-    """Colour of residuals (n, q) about offset and drift, of outputs that forget soon enough.
+    """Colour of residuals (n, q) about offset and drift, of outputs that these tell more of.
 
-    These are no colour: an autoregression would take them for a memory without end, and
-    whitening would erase them. Of noise that is nearly as slow as a record they are part. Each
+    They are no colour: an autoregression would take them for a memory without end, and whitening
+    would erase them. Of noise as slow as a record they are part; Schwarz's criterion decides. Each
     record has a line of its own: what is off in one of several is no slow noise of all.
     """
     line = np.zeros_like(residual)
@@ -144,7 +145,19 @@ def colour_about_line(
             time = at - at.mean()
             slope = (time @ residual[at, j]) / max(float(time @ time), 1.0)
             line[at, j] = residual[at, j].mean() + slope * time
-    centred = residual - line
-    model = colour(centred, seen, lengths)
-    soon = _FORGETS * longest_memory(model, np.mean(centred**2, axis=0)) <= min(lengths)
-    return model if soon.all() else colour(residual - np.where(soon, line, 0.0), seen, lengths)
+    columns = range(residual.shape[1])
+    straight = [
+        _is_straight(residual[:, [j]], line[:, [j]], seen[:, [j]], lengths) for j in columns
+    ]
+    return colour(residual - np.where(straight, line, 0.0), seen, lengths)
+
+
+def _is_straight(
+    residual: FloatArray, line: FloatArray, seen: BoolArray, lengths: tuple[int, ...]
+) -> bool:
+    """Whether lines through an output's residuals, (n, 1), are more than slow noise makes of it."""
+    if not line.any():
+        return False
+    about, whole = (colour(e, seen, lengths).criterion for e in (residual - line, residual))
+    lines = _OF_A_LINE * len(lengths) * math.log(max(len(residual), 2))
+    return about + lines < whole

@@ -8,6 +8,7 @@ backwards in time, so that nothing of the size of the record squared is ever for
 """
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,13 @@ import numpy as np
 from scipy.linalg import lapack
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.uncertainty.slow_noise import SlowFilter, SlowNoise, first_rows, slow_noise
+from sysid.uncertainty.slow_noise import (
+    SlowFilter,
+    SlowNoise,
+    regression_table,
+    remainder,
+    slow_noise,
+)
 
 _LARGEST_ORDER = 12
 _BY_CHANCE = 4.0  # standard deviations of a correlation, to which it may come by chance
@@ -27,27 +34,35 @@ class Autoregression:
     """x_t = sum_k A_k x_(t-k) + eps_t; coefficients: (order, q, q), noise: (q, q).
 
     x: the residuals, of outputs with a slow part what a filter of that leaves of them. slow: that
-    part of each output, or none; empty where no output has any.
+    part of each output, or none; empty where no output has any. deviance: minus twice the logarithm
+    of the likelihood but for what residuals of the same samples share; criterion: Schwarz's.
     """
 
     coefficients: FloatArray
     noise: FloatArray
     slow: tuple[SlowNoise | None, ...] = ()
+    deviance: float = math.inf
+    criterion: float = math.inf
 
     def filters(self, seen: BoolArray, lengths: Sequence[int]) -> dict[int, SlowFilter]:
         """Filters of the outputs with a slow part, by their places; seen: (n, q), as measured."""
-        begins = first_rows(lengths)
         return {
-            j: SlowFilter.of(noise, seen[:, j], begins)
+            j: SlowFilter.of(noise, seen[:, j], lengths)
             for j, noise in enumerate(self.slow)
             if noise is not None
         }
 
 
-def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Autoregression:
+def colour(
+    residual: FloatArray,
+    seen: BoolArray,
+    lengths: Sequence[int],
+    slopes: FloatArray | None = None,
+) -> Autoregression:
     """Colour of residuals (n, q) of records of the given lengths.
 
-    seen: (n, q), which samples were measured; only equations without a lost one count.
+    seen: (n, q), which samples were measured; only equations without a lost one count. slopes: (n,
+    q, p), of the fit that has left them.
     """
     q = residual.shape[1]
     whole = np.all(seen[:, seen.any(axis=0)], axis=1)
@@ -55,43 +70,46 @@ def colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Aut
         # Outputs that are never measured together: of each its own variance.
         variance = np.sum(residual**2, axis=0) / np.maximum(seen.sum(axis=0), 1)
         return Autoregression(np.zeros((0, q, q)), np.diag(variance))
-    plain, criterion = _autoregression(residual, whole, lengths)
+    plain = _autoregression(residual, whole, lengths)
     order = _largest_order(whole, lengths, 1)
-    slow = tuple(slow_noise(e, s, lengths, order) for e, s in zip(residual.T, seen.T, strict=True))
+    parts = [None] * q if slopes is None else list(np.moveaxis(slopes, 1, 0))
+    tables = list(map(regression_table, residual.T, seen.T, parts))
+    slow = tuple(slow_noise(*pair, lengths, order) for pair in zip(tables, seen.T, strict=True))
     if not order or not any(slow):
         return plain
-    filtered, more = residual.copy(), 0.0
+    filtered, sizes = residual.copy(), 0.0
     filters = Autoregression(plain.coefficients, plain.noise, slow).filters(seen, lengths)
     for j, kalman in filters.items():
-        for rows in record_rows(lengths):
-            filtered[rows, j : j + 1] = kalman.innovations(residual[rows, j : j + 1], rows)
-        more += 2.0 * float(np.sum(np.log(kalman.sizes))) + 2.0 * np.log(len(residual))
-    beside, lower = _autoregression(filtered, whole, lengths)
-    return replace(beside, slow=slow) if lower + more < criterion else plain
+        filtered[:, j] = remainder(kalman.innovations(tables[j]))[0]
+        sizes += 2.0 * float(np.sum(np.log(kalman.sizes)))
+    beside = _autoregression(filtered, whole, lengths)
+    criterion = beside.criterion + sizes + 2.0 * len(filters) * math.log(len(residual))
+    beside = replace(beside, slow=slow, deviance=beside.deviance + sizes, criterion=criterion)
+    return min(plain, beside, key=lambda model: model.criterion)
 
 
 def _autoregression(
     residual: FloatArray, whole: BoolArray, lengths: Sequence[int]
-) -> tuple[Autoregression, float]:
-    """That of residuals (n, q) by least squares, and its Schwarz criterion; whole: (n,) rows."""
+) -> Autoregression:
+    """That of residuals (n, q) by least squares; whole: (n,), rows of which nothing was lost."""
     q = residual.shape[1]
     largest = _largest_order(whole, lengths, q)
     y, past = _regression(residual, whole, lengths, largest)
     basis = np.linalg.qr(past)[0]
-    best, lowest = 0, np.inf
+    best, lowest, deviance = 0, math.inf, math.inf
     for order in range(largest + 1):
         part = basis[:, : order * q]
         noise = _covariance(y - part @ (part.T @ y), order)
         # A tiny part of its own: an output that never errs has no logarithm.
         sign, size = np.linalg.slogdet(noise + 1e-300 * np.eye(q))
-        criterion = len(y) * size + np.log(max(len(y), 2)) * order * q * q
+        criterion = float(len(y) * size + np.log(max(len(y), 2)) * order * q * q)
         if sign > 0 and criterion < lowest:
-            best, lowest = order, criterion
+            best, lowest, deviance = order, criterion, float(len(y) * size)
     y, past = _regression(residual, whole, lengths, best)
     solution = np.asarray(np.linalg.lstsq(past, y, rcond=None)[0], dtype=np.float64)
     noise = _covariance(y - past @ solution, best)
     coefficients = np.moveaxis(solution.reshape(best, q, q), 1, 2)
-    return Autoregression(_decaying(coefficients, len(y)), noise), float(lowest)
+    return Autoregression(_decaying(coefficients, len(y)), noise, (), deviance, lowest)
 
 
 def record_rows(lengths: Iterable[int]) -> list[slice]:

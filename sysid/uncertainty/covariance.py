@@ -107,7 +107,7 @@ def covariance(
     weight = sensitivity.objective.least_squares_weights(residual)
     weighted = slopes * weight[:, None]
     if score is None:
-        score = _score(sensitivity, weight, weighted, ties)
+        score = _score(sensitivity, weight, weighted, ties, held)
     felt = _felt(sensitivity, weight, ties, held)
     inverse = felt.back @ felt.back.T
     return Covariance(
@@ -161,11 +161,20 @@ def _foretold(local: Sensitivity, weight: FloatArray, felt: _Felt) -> FloatArray
 
 
 def _score(
-    sensitivity: Sensitivity, weight: FloatArray, weighted: FloatArray, ties: FloatArray
+    sensitivity: Sensitivity,
+    weight: FloatArray,
+    weighted: FloatArray,
+    ties: FloatArray,
+    held: BoolArray | None,
 ) -> FloatArray:
-    """Covariance of the score by all noise, (n_free, n_free); weighted: slopes times weights."""
-    residual = sensitivity.residual
-    noise = colour(residual, sensitivity.seen, sensitivity.lengths)
+    """Covariance of the score by all noise, (n_free, n_free).
+
+    weighted: slopes times weights; held: (n_free,), coordinates that were not fitted.
+    """
+    residual, fitted = sensitivity.residual, sensitivity.slopes
+    if held is not None:
+        fitted = fitted[..., ~held]
+    noise = colour(residual, sensitivity.seen, sensitivity.lengths, fitted)
     score = score_covariance(weighted, sensitivity.seen, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))

@@ -18,7 +18,7 @@ Of fast noise that is no white one, eps is what of it remains; an autoregression
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -28,8 +28,11 @@ from numba import njit
 from sysid.arrays import BoolArray, FloatArray, IntArray
 
 _FASTEST = 0.5  # samples that the zero's response takes to decay, at least
-_STEPS = (2.0, math.sqrt(2.0), 2.0**0.25)  # of time constants that are tried, ever finer
+_STEPS = (4.0, 2.0, math.sqrt(2.0), 2.0**0.25)  # of time constants that are tried, ever finer
 _PARAMETERS = 2
+_ALIKE = 1.0  # of a criterion, that tells a memory from a longer one: a deviation
+_ROUNDING = 1e-9  # singular value in parts of the largest
+_SETTLED = 1e-14  # part of a variance that it changes from sample to sample, below which it rests
 
 
 @dataclass(frozen=True)
@@ -47,67 +50,129 @@ class SlowNoise:
 
 @dataclass(frozen=True)
 class SlowFilter:
-    """The Kalman filter of an output's slow noise: gains, sizes: (n,), as P / s and sqrt(s)."""
+    """The Kalman filter of an output's slow noise, of records that begin at rows ``begins``.
+
+    gains, sizes: (n,), as P / s and sqrt(s); no gain where a sample was lost.
+    """
 
     pole: float
+    begins: IntArray
     gains: FloatArray
     sizes: FloatArray
 
     @classmethod
-    def of(cls, noise: SlowNoise, seen: BoolArray, begins: IntArray) -> Self:
-        """seen: (n,), which samples were measured; begins: first rows of the records."""
-        return cls(noise.pole, *_gains(noise.pole, noise.zero, seen, begins))
+    def of(cls, noise: SlowNoise, seen: BoolArray, lengths: Sequence[int]) -> Self:
+        """seen: (n,), which samples were measured."""
+        begins = _first_rows(lengths)
+        return cls(noise.pole, begins, *_gains(noise.pole, noise.zero, seen, begins))
 
-    def innovations(self, signals: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Signals (n, k) without what is foreseen of their slow part; rows: those of one record."""
-        gains, sizes = self.gains[rows], self.sizes[rows]
-        return _innovations(np.ascontiguousarray(signals), self.pole, gains, sizes)
+    def innovations(self, signals: FloatArray, rows: slice | None = None) -> FloatArray:
+        """Signals (n, k) without what is foreseen of their slow part; rows: of one record."""
+        begins = self.begins if rows is None else _first_rows([len(signals)])
+        signals = np.ascontiguousarray(signals)
+        return _innovations(signals, begins, self.pole, *self._of(rows))
 
-    def back(self, signals: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """The transpose of ``innovations``, of signals (n, k)."""
-        gains, sizes = self.gains[rows], self.sizes[rows]
-        return _back(np.ascontiguousarray(signals), self.pole, gains, sizes)
+    def back(self, signals: FloatArray, rows: slice) -> FloatArray:
+        """The transpose of ``innovations``, of signals (n, k) of one record."""
+        return _back(np.ascontiguousarray(signals), self.pole, *self._of(rows))
 
     def response(self, slopes: FloatArray, rows: slice) -> FloatArray:
         """The transpose of what makes noise of innovations, of slopes (n, k) of one record."""
-        gains, sizes = self.gains[rows], self.sizes[rows]
-        return _response(np.ascontiguousarray(slopes), self.pole, gains, sizes)
+        return _response(np.ascontiguousarray(slopes), self.pole, *self._of(rows))
+
+    def _of(self, rows: slice | None) -> tuple[FloatArray, FloatArray]:
+        return (self.gains, self.sizes) if rows is None else (self.gains[rows], self.sizes[rows])
+
+
+def regression_table(
+    residual: FloatArray, seen: BoolArray, slopes: FloatArray | None
+) -> FloatArray:
+    """An orthonormal basis of slopes (n, p), if any, and behind it residuals (n,): (n, k + 1).
+
+    Zero where a sample was not seen, (n,).
+    """
+    signal = np.where(seen, residual, 0.0)[:, None]
+    if slopes is None:
+        return signal
+    basis, sizes, _ = np.linalg.svd(np.where(seen[:, None], slopes, 0.0), full_matrices=False)
+    return np.hstack([basis[:, sizes > _ROUNDING * sizes.max(initial=0.0)], signal])
+
+
+def remainder(table: FloatArray) -> tuple[FloatArray, float]:
+    """What columns (n, k + 1) leave of the last of them, and the logarithm of their volume."""
+    columns, signal = table[:, :-1], table[:, -1]
+    if not columns.size:
+        return signal, 0.0
+    gram = columns.T @ columns
+    left = signal - columns @ np.linalg.lstsq(gram, columns.T @ signal, rcond=None)[0]
+    return left, float(np.linalg.slogdet(gram)[1])
 
 
 def slow_noise(
-    residual: FloatArray, seen: BoolArray, lengths: Sequence[int], order: int
+    table: FloatArray, seen: BoolArray, lengths: Sequence[int], order: int
 ) -> SlowNoise | None:
-    """The slow part of an output's residuals (n,); None where an autoregression tells as much.
+    """The slow part of an output's residuals; None where an autoregression tells as much.
 
-    seen: (n,), which were measured. order: the highest of the autoregression of what is left. By
-    Schwarz's criterion, with autoregressions by their correlations (Levinson).
+    table: (n, k + 1), as of ``regression_table``. order: the highest of the autoregression of what
+    is left. By Schwarz's criterion, with autoregressions by their correlations, of the likelihood
+    of what no fit can take out (restricted maximum likelihood; Patterson & Thompson, "Recovery of
+    inter-block information when block sizes are unequal", Biometrika 58, 1971): where slopes are
+    slow, a fit has taken most of a slow noise. Of memories that it hardly tells apart the longest.
     """
-    begins = first_rows(lengths)
-    signal = np.where(seen, residual, 0.0)
-    if not signal.any():
+    if not table[:, -1].any():
         return None
+    begins, freedom = _first_rows(lengths), table.shape[1] - 1
 
     def criterion(pole_time: float, zero_time: float) -> float:
         pole, zero = math.exp(-1.0 / pole_time), math.exp(-1.0 / zero_time)
         gains, sizes = _gains(pole, zero, seen, begins)
-        return _criterion(_filtered(signal, begins, pole, gains, sizes), sizes, begins, order)
+        left, volume = remainder(_innovations(table, begins, pole, gains, sizes))
+        return _criterion(left, sizes, begins, order, freedom) + volume
 
-    plain = _criterion(signal, np.ones(len(signal)), begins, order)
-    longest, best = float(max(lengths)), (math.inf, 0.0, 0.0)
-    times = _FASTEST * _STEPS[0] ** np.arange(math.log2(longest / _FASTEST) + 1.0)
-    tried = [(a, b) for a in np.minimum(times, longest).tolist() for b in times.tolist()]
-    for step in _STEPS:
-        if best[1]:
-            ways = (1.0 / step, 1.0, step)
-            tried = [(best[1] * a, best[2] * b) for a in ways for b in ways if a != 1.0 or b != 1.0]
-        pairs = [(a, b) for a, b in tried if _FASTEST <= b < a <= longest]
-        best = min([best, *((criterion(a, b), a, b) for a, b in pairs)])
-    if best[0] + _PARAMETERS * math.log(max(int(seen.sum()), 2)) >= plain:
+    plain = _criterion(remainder(table)[0], np.ones(len(table)), begins, order, freedom)
+    best, pole_time, zero_time = _lowest(criterion, float(max(lengths)), plain)
+    if best + _PARAMETERS * math.log(max(int(seen.sum()), 2)) >= plain:
         return None
-    return SlowNoise(math.exp(-1.0 / best[1]), math.exp(-1.0 / best[2]))
+    return SlowNoise(math.exp(-1.0 / pole_time), math.exp(-1.0 / zero_time))
 
 
-def first_rows(lengths: Sequence[int]) -> IntArray:
+_Criterion = Callable[[float, float], float]
+_Minimum = tuple[float, float, float]  # of a criterion, and the times of pole and zero there
+
+
+def _lowest(criterion: _Criterion, longest: float, plain: float) -> _Minimum:
+    """The minimum, on a grid that becomes finer, or the longest memory up to that about as good.
+
+    plain: the criterion without a slow part, from where on the coarsest grid will do.
+    """
+    times = _FASTEST * _STEPS[0] ** np.arange(math.log(longest / _FASTEST, _STEPS[0]) + 1.0)
+    places = [(a, b) for a in np.minimum(times, longest).tolist() for b in times.tolist()]
+    best = _best_of(criterion, places, longest)
+    if best[0] >= plain:
+        return best
+    for step in _STEPS[1:]:
+        ways = (1.0 / step, 1.0, step)
+        beside = [(best[1] * a, best[2] * b) for a in ways for b in ways if a != 1.0 or b != 1.0]
+        best = min(best, _best_of(criterion, beside, longest))
+    lowest, (finer, finest) = best[0], _STEPS[-2:]
+    while best[1] < longest:
+        longer = min(finer * best[1], longest)
+        beside = [(longer, best[2] * way) for way in (1.0 / finest, 1.0, finest)]
+        alike = _best_of(criterion, beside, longest)
+        if alike[0] > lowest + _ALIKE:
+            break
+        best = alike
+    return best
+
+
+def _best_of(
+    criterion: _Criterion, places: Sequence[tuple[float, float]], longest: float
+) -> _Minimum:
+    allowed = [(a, b) for a, b in places if _FASTEST <= b < a <= longest]
+    return min(((criterion(a, b), a, b) for a, b in allowed), default=(math.inf, 0.0, 0.0))
+
+
+def _first_rows(lengths: Sequence[int]) -> IntArray:
     """Rows at which records of these lengths begin, one after another, and where the last ends."""
     rows: IntArray = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     return rows
@@ -121,44 +186,33 @@ def _gains(
     new = (pole - zero) * (1.0 - pole * zero) / pole
     gains, sizes = np.zeros(n), np.ones(n)
     for record in range(len(begins) - 1):
-        variance = new / (1.0 - pole * pole)
+        variance, before, gain, size, left = new / (1.0 - pole * pole), 0.0, 0.0, 1.0, 0.0
         for t in range(begins[record], begins[record + 1]):
-            left = variance
-            if seen[t]:
+            if not seen[t]:
+                variance = pole * pole * variance + new
+                continue
+            if abs(variance - before) > _SETTLED * variance:
                 whole = variance + white
-                gains[t], sizes[t] = variance / whole, math.sqrt(whole)
-                left = variance * white / whole
-            variance = pole * pole * left + new
+                gain, size, left = variance / whole, math.sqrt(whole), variance * white / whole
+            gains[t], sizes[t] = gain, size
+            before, variance = variance, pole * pole * left + new
     return gains, sizes
 
 
 @njit(cache=True, nogil=True)
-def _filtered(
-    signal: FloatArray, begins: IntArray, pole: float, gains: FloatArray, sizes: FloatArray
-) -> FloatArray:
-    """Innovations (n,) of a signal of records that begin at those rows."""
-    white = np.empty(len(signal))
-    for record in range(len(begins) - 1):
-        slow = 0.0
-        for t in range(begins[record], begins[record + 1]):
-            error = signal[t] - slow
-            white[t] = error / sizes[t] if gains[t] > 0.0 else 0.0
-            slow = pole * (slow + gains[t] * error)
-    return white
-
-
-@njit(cache=True, nogil=True)
 def _innovations(
-    signals: FloatArray, pole: float, gains: FloatArray, sizes: FloatArray
+    signals: FloatArray, begins: IntArray, pole: float, gains: FloatArray, sizes: FloatArray
 ) -> FloatArray:
+    """Innovations (n, k) of signals of records that begin at those rows."""
     n, count = signals.shape
     white, slow = np.zeros((n, count)), np.zeros(count)
-    for t in range(n):
-        for i in range(count):
-            error = signals[t, i] - slow[i]
-            if gains[t] > 0.0:
-                white[t, i] = error / sizes[t]
-            slow[i] = pole * (slow[i] + gains[t] * error)
+    for record in range(len(begins) - 1):
+        slow[:] = 0.0
+        for t in range(begins[record], begins[record + 1]):
+            for i in range(count):
+                error = signals[t, i] - slow[i]
+                white[t, i] = error / sizes[t] if gains[t] > 0.0 else 0.0
+                slow[i] = pole * (slow[i] + gains[t] * error)
     return white
 
 
@@ -187,18 +241,18 @@ def _response(slopes: FloatArray, pole: float, gains: FloatArray, sizes: FloatAr
 
 
 @njit(cache=True, nogil=True)
-def _criterion(signal: FloatArray, sizes: FloatArray, begins: IntArray, order: int) -> float:
+def _criterion(
+    signal: FloatArray, sizes: FloatArray, begins: IntArray, order: int, freedom: int
+) -> float:
     """Schwarz's criterion of the best autoregression of a signal (n,), and the sizes' logarithms.
 
     By Durbin's recursion along the correlations.
     """
     n = len(signal)
-    sums, logs = np.zeros(order + 1), 0.0
-    for record in range(len(begins) - 1):
-        for t in range(begins[record], begins[record + 1]):
-            logs += 2.0 * math.log(sizes[t])
-            for lag in range(min(order, t - begins[record]) + 1):
-                sums[lag] += signal[t] * signal[t - lag]
+    sums, logs = _products(signal, begins, order), 0.0
+    for size in sizes:
+        if size != 1.0:
+            logs += 2.0 * math.log(size)
     variance, least = sums[0] / n, math.inf
     coefficients, before = np.zeros(order + 1), np.zeros(order + 1)
     for k in range(order + 1):
@@ -214,5 +268,18 @@ def _criterion(signal: FloatArray, sizes: FloatArray, begins: IntArray, order: i
             variance *= 1.0 - reflection * reflection
         if variance <= 0.0:
             return -math.inf
-        least = min(least, n * math.log(variance) + k * math.log(n))
+        least = min(least, (n - freedom) * math.log(variance) + k * math.log(n))
     return least + logs
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _products(signal: FloatArray, begins: IntArray, order: int) -> FloatArray:
+    """Sums of products of samples so many apart, (order + 1,), in whatever order vectors take."""
+    sums = np.zeros(order + 1)
+    for lag in range(order + 1):
+        for record in range(len(begins) - 1):
+            total = 0.0
+            for t in range(begins[record] + lag, begins[record + 1]):
+                total += signal[t] * signal[t - lag]
+            sums[lag] += total
+    return sums
