@@ -68,21 +68,29 @@ class Intervals:
         self.changing: list[int] = self._lanes.kernel.interpolated
 
     def causes(
-        self, inputs: FloatArray | None = None, rates: FloatArray | None = None
+        self,
+        inputs: FloatArray | None = None,
+        rates: FloatArray | None = None,
+        before: FloatArray | None = None,
     ) -> FloatArray:
         """What acts in each interval, (n_samples - 1, n_causes).
 
         Inputs, (n_samples, n_inputs), at its begin and what is added to rates, (n_samples,
         n_states), which may lack the last states; then those of these that are not held at its end.
+        before: rates just before each sample, where these jump there.
         """
+        begins = self._causes_at(inputs, rates)
+        ends = begins if before is None else self._causes_at(inputs, before)
+        return np.hstack([begins[:-1], ends[1:, self.changing]])
+
+    def _causes_at(self, inputs: FloatArray | None, rates: FloatArray | None) -> FloatArray:
         n, signals = len(self.inputs), []
         for given, like in ((inputs, self.model.inputs), (rates, self.model.states)):
             signal = np.zeros((n, len(like)))
             if given is not None:
                 signal[:, : given.shape[1]] = given
             signals.append(signal)
-        whole = np.hstack(signals)
-        return np.hstack([whole[:-1], whole[1:, self.changing]])
+        return np.hstack(signals)
 
     def held(self, inputs: FloatArray) -> FloatArray:
         """As of ``causes``, of inputs (n_samples, n_inputs) that stay as they are for an interval.

@@ -56,6 +56,7 @@ class LinearResponse:
         start: FloatArray | None = None,
         vector: FloatArray | None = None,
         held: FloatArray | None = None,
+        before: FloatArray | None = None,
     ) -> FloatArray:
         """Changes of the outputs, or of what is kept of the innovations, (n_samples, n_outputs).
 
@@ -63,13 +64,14 @@ class LinearResponse:
         (n_samples, n_inputs), and to outputs, (n_samples, n_outputs); start: (n_states,), by where
         the states begin elsewhere; vector: (n_parameters,), by what is added to the equations'
         parameters; held: (n_samples, n_inputs), by what is added to inputs from each sample to the
-        next. Behind the model's states and outputs stand integrals of those that are averaged,
-        which may be left out.
+        next; before: of the rates' shape, what they are just before each sample, where they jump as
+        inputs do that are held. Behind the model's states and outputs stand integrals of those that
+        are averaged, which may be left out.
         """
         n, _, m = self.rows.shape
         pushes, first = np.zeros((n, m)), np.zeros(m)
         if rates is not None or inputs is not None:
-            causes = self.slopes.intervals.causes(inputs, rates)
+            causes = self.slopes.intervals.causes(inputs, rates, before)
             _push(pushes, self.slopes.by_causes, causes)
         if held is not None:
             _push(pushes, self.slopes.by_causes, self.slopes.intervals.held(held))

@@ -131,10 +131,12 @@ def examine(
     simulated: FloatArray,
     expected: ExpectedErrors | None = None,
     starts: Starts | None = None,
+    later: BoolArray | None = None,
 ) -> RecordResult:
     """Errors and residual tests of a model's free run, (n_samples, n_outputs), on a record.
 
-    expected: errors that a right model makes on it; None where nothing is known of them.
+    expected: errors that a right model makes on it; None where nothing is known of them. later:
+    (n_inputs,), inputs that act on no output of their sample.
     """
     residual, finite = record.outputs - simulated, bool(np.all(np.isfinite(simulated)))
     systematic = None if expected is None else expected.systematic
@@ -153,7 +155,9 @@ def examine(
         record.name,
         finite,
         evaluate(record.outputs, simulated),
-        residual_test(residual, record.inputs, record.input_noise, systematic=systematic),
+        residual_test(
+            residual, record.inputs, record.input_noise, systematic=systematic, later=later
+        ),
         None if expected is None else floor_test(residual, expected),
         None if expected is None else floor_test(residual, expected.of_exact_parameters),
         starts,
@@ -606,10 +610,9 @@ def _moving(finding: Finding) -> str:
     says = "The data ask for " if finding.amplitude is None else ""
     if finding.widens:
         moved.append(f"intervals {finding.wider:.1f} times as wide")
+    way = "weighed by their colour, they ask for" if finding.kind == "feedback" else "with that"
     effect = (
-        f"with that {', '.join(moved)}"
-        if moved
-        else f"{100.0 * finding.share:.0f} % of what is left"
+        f"{way} {', '.join(moved)}" if moved else f"{100.0 * finding.share:.0f} % of what is left"
     )
     # A line leads nowhere that far.
     far = finding.turned_round or finding.kind == "rest"

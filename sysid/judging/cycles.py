@@ -130,7 +130,7 @@ def _integral(speed: int, run: DisturbedRun) -> FloatArray:
 def _positions(runs: Sequence[DisturbedRun], physical: Sequence[int]) -> Iterator[tuple[int, int]]:
     """States whose rate is in proportion to another in whose equation a parameter acts."""
     states = np.concatenate([run.states for run in runs])
-    rates = np.concatenate([run.rates for run in runs])
+    rates = np.concatenate([run.rates.after for run in runs])
     for position in range(states.shape[1]):
         rate = rates[:, position]
         if position in physical or not np.any(rate):

@@ -27,6 +27,29 @@ _FINE = 4  # steps of the integration in a sample, for what is to differ from an
 _FELT = 1e-3  # part of an output's motion that inputs without noise do at least, or it is none
 
 
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """Rates of the states just after each sample and just before it, (n_samples, n_states) each.
+
+    Straight from the one to the other; inputs that are held jump at samples. Of what a feedback
+    has made an input of a sample acts after it alone: noise of that sample is in the input as well.
+    """
+
+    after: FloatArray
+    before: FloatArray
+
+    def __sub__(self, rates: "Rates") -> "Rates":
+        return Rates(self.after - rates.after, self.before - rates.before)
+
+    def __mul__(self, factor: float | FloatArray) -> "Rates":
+        return Rates(self.after * factor, self.before * factor)
+
+
+def delayed(signal: FloatArray) -> FloatArray:
+    """A signal (n_samples, ...) by a sample later."""
+    return np.concatenate([signal[:1], signal[:-1]])
+
+
 @dataclass(eq=False)
 class DisturbedRun:
     """A free run of a record under parameters (n_parameters,), and what disturbances change.
@@ -109,13 +132,15 @@ class DisturbedRun:
         instants = observed(self.model, self.states, self.record.inputs, self.vector)
         return self._as_measured(np.hstack([instants, integrals]), windows)
 
-    def rates_of(self, derivative: Callable[..., Any], vector: FloatArray) -> FloatArray:
-        """Values of another derivative along the run, (n_samples, n_states), NaN where it fails."""
-        return rates_along(derivative, self.states, self.record.inputs, vector)
+    def rates_of(self, derivative: Callable[..., Any], vector: FloatArray) -> Rates:
+        """Values of another derivative along the run, NaN where it fails."""
+        inputs, held = self.record.inputs, [given.hold == "zoh" for given in self.model.inputs]
+        before = np.where(held, delayed(inputs), inputs)
+        return Rates(*(rates_along(derivative, self.states, u, vector) for u in (inputs, before)))
 
-    def added(self, rates: FloatArray) -> FloatArray:
-        """Change of the outputs per unit of what is added to the rates, both (n_samples, ...)."""
-        return self._change(self.response.of(rates=rates))
+    def added(self, rates: Rates) -> FloatArray:
+        """Change of the outputs, (n_samples, n_outputs), per unit of what is added to the rates."""
+        return self._change(self.response.of(rates=rates.after, before=rates.before))
 
     def driven(self, inputs: FloatArray) -> FloatArray:
         """Change of the outputs per unit of a change of the inputs, (n_samples, n_inputs)."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.arrays import FloatArray
+from sysid.arrays import BoolArray, FloatArray
 from sysid.fitting.free_run import AccurateRun
 from sysid.fitting.innovations import MISJUDGED
 from sysid.fitting.objective import Objective
@@ -21,7 +21,7 @@ from sysid.judging.score_tests import ScoreTests, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
 from sysid.problem.faults import data_faults
-from sysid.problem.model import ModelError, Parameter
+from sysid.problem.model import ModelError, Parameter, ProcessModel
 from sysid.threads import one_thread
 from sysid.uncertainty import Uncertainty
 
@@ -86,8 +86,9 @@ def examined(
     """
     run = AccurateRun.of(estimator.simulator(), estimator.vector_, record)
     starts = estimated_starts(run.simulator, estimator.vector_, record, run.start)
+    later = _acting_later(run.simulator.model, record)
     if uncertainty is None:
-        return run.outputs, examine(record, run.outputs, starts=starts)
+        return run.outputs, examine(record, run.outputs, starts=starts, later=later)
     expected = expected_errors(
         run.simulator,
         estimator.space_,
@@ -96,7 +97,14 @@ def examined(
         run.start,
         uncertainty.by_slopes,
     )
-    return run.outputs, examine(record, run.outputs, expected, starts)
+    return run.outputs, examine(record, run.outputs, expected, starts, later)
+
+
+def _acting_later(model: ProcessModel, record: Dataset) -> BoolArray:
+    """Inputs that act on no output of their sample, (n_inputs,): held, and through states alone."""
+    ahead = bool(record.windows.size) and bool(np.any(record.windows[..., 1] > 0.0))
+    through = model.output is None and not ahead
+    return np.array([through and given.hold == "zoh" for given in model.inputs], dtype=bool)
 
 
 @one_thread()

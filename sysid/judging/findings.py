@@ -102,6 +102,8 @@ _WORDS = {
     "saturation": "{name} saturates near its largest values",
     "fixed": "{name}, which is fixed, would be {times:.3g} times its value, or the gain of a "
     "channel is wrong that looks the same",
+    "feedback": "{name} answers what the outputs err by, as a controller's output does, and these "
+    "errors have a memory: the fit has taken part of the answer for the plant's",
     "exchange": "{name} have changed places in the log",
 }
 # What has no single amplitude.

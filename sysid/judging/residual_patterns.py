@@ -54,7 +54,8 @@ def errors_by_speed(
     where chance explains it, or what a right model leaves.
     """
     trend = np.zeros(residual.shape[1])
-    rates = np.abs(np.gradient(simulated, axis=0))
+    # Since the sample before: what comes after may answer the error.
+    rates = np.abs(np.diff(simulated, axis=0, prepend=simulated[:1]))
     for j in np.flatnonzero(~_explained(residual, systematic)):
         seen = np.isfinite(residual[:, j])
         errors, speeds = np.abs(residual[seen, j]), rates[seen, j]

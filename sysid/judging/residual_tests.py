@@ -26,7 +26,8 @@ class ResidualTest:
     their deviations; cross_band: (n_outputs, n_inputs); chance: likewise, probability of
     correlations so large at all lags together, were nothing left; 1 where that is not tested.
     tested: (n_inputs,), inputs that say something: they change, and are not themselves measured
-    with noise, which stands in the residuals as well.
+    with noise, which stands in the residuals as well. Of inputs that act after their sample the
+    correlations at lag 0 are none: it is not the plant that makes them, but whoever made the input.
     """
 
     lags: IntArray
@@ -55,13 +56,14 @@ def residual_test(
     input_noise: FloatArray | None = None,
     n_lags: int = LAGS,
     systematic: FloatArray | None = None,
+    later: BoolArray | None = None,
 ) -> ResidualTest:
     """Correlations of measured minus simulated, (n, n_outputs), NaN where a sample was lost.
 
     inputs: (n, n_inputs); input_noise: (n_inputs,), standard deviation of the noise that they were
     measured with. n_lags: at most a quarter of the record is used. systematic: (n, n_outputs, k),
     independent errors, by a standard deviation each, that a right model may make and that go with
-    the inputs: its bands are wider by them.
+    the inputs: its bands are wider by them. later: (n_inputs,), inputs that act after their sample.
     """
     n_lags = max(2, min(n_lags, len(residual) // 4))
     seen = np.isfinite(residual)
@@ -69,6 +71,8 @@ def residual_test(
     counted = np.maximum(seen.sum(axis=0), 1)
     auto = _autocorrelations(e)
     cross = np.stack([_products(e, u, k) for k in range(n_lags)]) / counted[:, None]
+    if later is not None:
+        cross[0, :, later] = 0.0
     # Both being coloured widens the band: sum over k of R_e(k) R_u(k) / n is the variance.
     covariance = _coloured(auto, u, n_lags) / counted[:, None]
     variance = np.maximum(covariance[0], _LEAST_VARIANCE / counted[:, None])

@@ -31,7 +31,9 @@ from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.judging.background import Background, of_filter, of_free_runs, quiet_sensitivity
 from sysid.judging.cycles import cycle_suspects
-from sysid.judging.findings import Finding, Move, moves_of
+from sysid.judging.disturbed import DisturbedRun
+from sysid.judging.feedback import answer_probability, answers
+from sysid.judging.findings import MOVED, Finding, Move, moves_of
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
     Suspect,
@@ -59,7 +61,8 @@ from sysid.uncertainty.sensitivity import (
 )
 from sysid.uncertainty.ties import coded_gradient
 
-_LOG_CHANCE = np.log(1e-3)  # of the probability of a finding by chance, all tests together
+_BY_CHANCE = 1e-3
+_LOG_CHANCE = np.log(_BY_CHANCE)  # of the probability of a finding by chance, all tests together
 _LOG_SURE = np.log(1e-9)  # from where on it does not matter how small it is
 # Have no single amplitude.
 _SEVERAL = ("variant", "bend", "function", "curve", "disturbance", "rest")
@@ -117,6 +120,15 @@ class ScoreTests:
         held = of_filter(local) if filtered else of_free_runs(local, records)
         local, runs, background = held
         self._runs, self._tests = runs, _Tests(local, background, runs[0].workers)
+        self._answered, self._answering = self._tests, self._tests.answering(runs)
+        if self._answering:
+            # What an input answers at once goes with what it would do if it were late.
+            q, lengths = local.residual.shape[1], local.lengths
+            signals = np.concatenate([run.measured for run in runs])
+            later = [answers(signals[:, i], lengths, q) for i in self._answering]
+            foreseen = np.concatenate([background.foreseen, *later], axis=2)
+            background = replace(background, foreseen=foreseen)
+            self._tests = _Tests(local, background, runs[0].workers)
         noisy = [runs[0].model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
         channels = list(channel_suspects(runs))
         # Noise of an input makes its gain look smaller, and play takes it off: that is no fault.
@@ -143,7 +155,7 @@ class ScoreTests:
         changing = [*change_suspects(self._runs, alone)]
         # Among more suspects what is left to chance by itself is so all the more.
         if not self.suspicious and not tests.are_significant(changing):
-            return ()
+            return self._answered.of(uncertainty).feedback(self._runs)
         at_rest = list(rest_suspects(self._runs))
         if at_rest and tests.leads([*self._named, *changing, *self._functions], at_rest):
             tests.admit(at_rest, most=1)
@@ -151,7 +163,12 @@ class ScoreTests:
         tests.admit([*self._named, *changing])
         if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
             tests.admit(self._functions)
-        return tests.settled()
+        findings = tests.settled()
+        if any(finding.counts for finding in findings):
+            return findings
+        feedback = self._answered.of(uncertainty).feedback(self._runs)
+        # What an input answers later looks as if it were late.
+        return (*feedback, *(f for f in findings if not (self._answering and f.comes_late)))
 
     @cached_property
     def _functions(self) -> list[Suspect]:
@@ -209,6 +226,38 @@ class _Tests:
         gradients = [_gradient(self._local, e) for e in tests._estimates]
         tests._gradients = np.array(gradients).reshape(-1, self._local.slopes.shape[2])
         return tests
+
+    def feedback(self, runs: Sequence[DisturbedRun]) -> tuple[Finding, ...]:
+        """The input that answers what outputs err by, where that has moved an estimate."""
+        if self._local.corrects:  # a filter's innovations are new
+            return ()
+        coefficients = self._regression.coefficients
+        moved = self._gradients @ coefficients[: self._gradients.shape[1]]
+        moves = tuple(map(self._within_limits, moves_of(self._estimates, moved.tolist())))
+        if not moves or abs(moves[0].deviations) < MOVED:
+            return ()
+        chances = self._chances(runs)
+        place = min(chances, key=lambda i: chances[i], default=0)
+        chance = len(chances) * chances.get(place, 1.0)
+        if chance > _BY_CHANCE:
+            return ()
+        name = runs[0].model.input_names[place]
+        return (Finding("feedback", name, "", 1.0, chance, 0.0, moves, of_input=True),)
+
+    def answering(self, runs: Sequence[DisturbedRun]) -> list[int]:
+        """Places of inputs that answer what outputs err by, by more than chance."""
+        chances = {} if self._local.corrects else self._chances(runs)
+        return [i for i, chance in chances.items() if len(chances) * chance < _BY_CHANCE]
+
+    def _chances(self, runs: Sequence[DisturbedRun]) -> dict[int, float]:
+        """Probabilities, by the inputs' places, that they answer errors by chance alone."""
+        rest = self._residual - self._columns @ self._regression.coefficients
+        white = self._regression.whitening.in_time(np.where(self._local.seen, rest, 0.0))
+        signals = np.concatenate([run.measured for run in runs])
+        return {
+            i: answer_probability(white, signals[:, i], self._local.lengths)
+            for i in np.flatnonzero(runs[0].record.input_noise == 0.0).tolist()
+        }
 
     def are_significant(self, suspects: Sequence[Suspect]) -> bool:
         """Whether any of the suspects is there by more than chance, before any is admitted."""

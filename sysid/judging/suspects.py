@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.linear_response import observed
-from sysid.judging.disturbed import DisturbedRun, of_each, shifted
+from sysid.judging.disturbed import DisturbedRun, Rates, delayed, of_each, shifted
 from sysid.judging.input_noise import likely_noise, standing_out
 from sysid.linear.polynomials import all_pole
 from sysid.problem.channels import noise
@@ -43,6 +43,7 @@ Kind = Literal[
     "rest",
     "fixed",
     "exchange",
+    "feedback",
 ]
 
 _PARTS = (0.5, 2.0)  # of a variant's further parameters
@@ -495,16 +496,14 @@ def of_terms(
 ) -> Suspect:
     """Functions of a signal (n_samples,) of each run, in equation i together."""
     state = runs[0].model.states[i]
-    columns = [_added(runs, i, partial(_term_along, term, signal, held)) for term in terms]
+    columns = [_added(runs, i, partial(_along, term, signal), held=held) for term in terms]
     return Suspect("function", state.name, f"{state.unit}/s", np.stack(columns, axis=2), terms)
 
 
-def _term_along(
-    term: AddedTerm, signal: Callable[[DisturbedRun], FloatArray], held: bool, run: DisturbedRun
+def _along(
+    term: AddedTerm, signal: Callable[[DisturbedRun], FloatArray], run: DisturbedRun
 ) -> FloatArray:
-    """Values (n_samples,) whose straight lines are in the mean what a held signal's steps are."""
-    values = _values(term, signal(run))
-    return 0.5 * (values + np.append(values[:1], values[:-1])) if held else values
+    return _values(term, signal(run))
 
 
 def _terms(
@@ -600,10 +599,9 @@ def _with_more(name: str, run: DisturbedRun) -> FloatArray:
     return vector
 
 
-def _followed(moved: FloatArray, run: DisturbedRun) -> FloatArray:
-    """How rates (n_samples, n_states) follow parameters that are moved by a part of something."""
-    rates: FloatArray = (run.rates_of(run.model.derivative, moved) - run.rates) / _PROBE
-    return rates
+def _followed(moved: FloatArray, run: DisturbedRun) -> Rates:
+    """How rates follow parameters that are moved by a part of something."""
+    return (run.rates_of(run.model.derivative, moved) - run.rates) * (1.0 / _PROBE)
 
 
 def _of_another_value(moved: FloatArray, run: DisturbedRun) -> FloatArray:
@@ -658,7 +656,7 @@ def change_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Itera
 def _drifting(moved: FloatArray, run: DisturbedRun) -> FloatArray:
     """Change by parameters that move by a part of what others differ by, in proportion to time."""
     rates = _followed(moved, run)
-    return run.added(rates * np.linspace(-0.5, 0.5, len(rates))[:, None])
+    return run.added(rates * np.linspace(-0.5, 0.5, run.record.n_samples)[:, None])
 
 
 def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
@@ -674,7 +672,7 @@ def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         moved = vector.copy()
         moved[place] += _PROBE * (vector[place] or 1.0)
         terms = [_followed(moved, run) for run in runs]
-        whole = np.concatenate(terms)
+        whole = np.concatenate([term.after for term in terms])
         if not (np.all(np.isfinite(whole)) and np.any(whole)):
             continue
         main = int(np.argmax(np.mean(whole**2, axis=0)))
@@ -700,13 +698,17 @@ def _alike(values: FloatArray, along: FloatArray) -> bool:
 
 def _bent(
     runs: Sequence[DisturbedRun],
-    terms: Sequence[FloatArray],
+    terms: Sequence[Rates],
     main: int,
     size: float,
     bend: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """Changes by terms (n_samples, n_states) of each run times a function of their size."""
-    added = [term * bend(np.abs(term[:, main]) / size)[:, None] for term in terms]
+    """Changes by terms of each run times a function of their size."""
+
+    def sized(term: FloatArray) -> FloatArray:
+        return term * bend(np.abs(term[:, main]) / size)[:, None]
+
+    added = [Rates(sized(term.after), sized(term.before)) for term in terms]
     return np.concatenate([run.added(part) for run, part in zip(runs, added, strict=True)])
 
 
@@ -722,10 +724,22 @@ def _signal(j: int, run: DisturbedRun) -> FloatArray:
 
 
 def _added(
-    runs: Sequence[DisturbedRun], i: int, signal: Callable[[DisturbedRun], FloatArray]
+    runs: Sequence[DisturbedRun],
+    i: int,
+    signal: Callable[[DisturbedRun], FloatArray],
+    *,
+    held: bool = False,
 ) -> FloatArray:
-    """Changes by a signal (n_samples,) of each run that is added to equation i."""
-    return of_each(runs, lambda run: run.added(_column(run.states, i, signal(run))))
+    """Changes by a signal (n_samples,) of each run that is added to equation i.
+
+    held: whether it stands from each sample to the next.
+    """
+
+    def change(run: DisturbedRun) -> FloatArray:
+        after = _column(run.states, i, signal(run))
+        return run.added(Rates(after, delayed(after) if held else after))
+
+    return of_each(runs, change)
 
 
 def physical_equations(run: DisturbedRun) -> list[int]:

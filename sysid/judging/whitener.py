@@ -1,7 +1,7 @@
 """Residuals and changes of the outputs, whitened by the residuals' autoregression."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
@@ -40,17 +40,22 @@ class Whitener:
         if local.corrects:
             return cls._of_innovations(local, residual)
         model = colour_about_line(residual, local.seen, measured, local.lengths)
+        return cls.by(model, local.seen, local.lengths)
+
+    @classmethod
+    def by(cls, model: Autoregression, seen: BoolArray, lengths: Sequence[int]) -> Self:
+        """By a colour; seen: (n_residuals, n_outputs), which samples were measured."""
         values, vectors = np.linalg.eigh(model.noise)
         floor = 1e-12 * max(float(values[-1]), 1e-300)
         roots = np.where(values > floor, 1.0 / np.sqrt(np.maximum(values, floor)), 0.0)
-        whole = np.all(local.seen | ~local.seen.any(axis=0), axis=1)
+        whole = np.all(seen | ~seen.any(axis=0), axis=1)
         kept, order = whole.copy(), len(model.coefficients)
-        for rows in record_rows(local.lengths):
+        for rows in record_rows(lengths):
             for k in range(1, order + 1):
                 kept[rows][k:] &= whole[rows][:-k]
             kept[rows][:order] = False
-        filters = model.filters(local.seen, local.lengths)
-        return cls(model, local.lengths, kept, (vectors * roots) @ vectors.T, filters)
+        filters = model.filters(seen, lengths)
+        return cls(model, tuple(lengths), kept, (vectors * roots) @ vectors.T, filters)
 
     @classmethod
     def _of_innovations(cls, local: Sensitivity, residual: FloatArray) -> Self:
@@ -83,6 +88,12 @@ class Whitener:
             if columns[rows].any():
                 whole[places] = self.of_record(rows, columns[rows])
         return whole
+
+    def in_time(self, residual: FloatArray) -> FloatArray:
+        """Whitened residuals, (n_residuals, n_outputs) both, 0 where these have no whole past."""
+        white = np.zeros_like(residual)
+        white[self.kept] = self(residual[..., None]).reshape(-1, self.n_outputs)
+        return white
 
     @cached_property
     def _records(self) -> list[tuple[slice, slice]]:

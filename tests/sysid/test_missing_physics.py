@@ -28,7 +28,7 @@ from benchmarks.stress import fitted, tried
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.examples import lag
 from sysid.gassi import GASSI
-from sysid.judging.disturbed import DisturbedRun
+from sysid.judging.disturbed import DisturbedRun, Rates
 from sysid.judging.examination import score_tests_of, suspected, verdict_of
 from sysid.judging.suspects import channel_suspects
 from sysid.judging.whitener import colour_about_line
@@ -345,7 +345,7 @@ def test_what_is_added_to_an_equation_moves_outputs_as_a_model_with_it_would():
     run = DisturbedRun.free(MODEL, vector, record, start, 4, Workers(1))
     added = np.zeros_like(run.states)
     added[:, 1] = -(run.states[:, 1] ** 3)
-    change = run.added(added)
+    change = run.added(Rates(added, added))
 
     eps = 1e-5
 
@@ -369,7 +369,7 @@ def test_rates_along_a_run_are_those_at_each_of_its_points(derivative):
     run = DisturbedRun.free(MODEL, vector, training, np.zeros(2), 4, Workers(1))
     points = zip(run.states, training.inputs, strict=True)
     expected = [derivative(tuple(x), tuple(u), tuple(vector)) for x, u in points]
-    np.testing.assert_allclose(run.rates_of(derivative, vector), expected, rtol=1e-12)
+    np.testing.assert_allclose(run.rates_of(derivative, vector).after, expected, rtol=1e-12)
 
 
 def slow_input(seed, late=0):
