@@ -145,6 +145,7 @@ class Identification(Shown):
             faults=self.faults,
             findings=None if suspicion is None else suspicion.findings,
             alternative=None if suspicion is None else suspicion.alternative,
+            unseen=() if suspicion is None else suspicion.unseen,
         )
         return ShownVerdict(verdict.predicted, verdict.parameters, verdict.notes)
 

@@ -17,7 +17,7 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.alternatives import Alternative
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.findings import MOVED, Finding, description
-from sysid.judging.phrases import change
+from sysid.judging.phrases import change, sized
 from sysid.judging.residual_patterns import errors_alone, errors_by_speed, shared_errors
 from sysid.judging.residual_tests import ResidualTest, residual_test
 from sysid.judging.starts import Starts
@@ -177,13 +177,14 @@ def judge(
     findings: Sequence[Finding] | None = None,
     alternative: Alternative | None = None,
     faults: Sequence[DataFault] = (),
+    unseen: Sequence[Finding] = (),
 ) -> Verdict:
     """The verdict on an identification.
 
     validation: none where no records were held back. uncertainty: None without intervals.
     feasible: whether the parameters satisfy the constraints. findings: of score tests, None where
     there were none; alternative: a variant among them that was fitted. faults: of
-    the data, of which those in doubt count.
+    the data, of which those in doubt count. unseen: what may be there all the same.
     """
     broken = [] if feasible else ["No parameters were found that satisfy all the constraints."]
     broken += _failed_runs(model, (*training, *validation))
@@ -227,6 +228,7 @@ def judge(
     moving = f"Found, but moving no parameter by {MOVED:g} standard deviations: {slight}."
     notes = [moving] if slight else []
     notes += [fault.sentence for fault in spoilt if fault.part == "validation"]
+    notes += [_not_seen(finding) for finding in unseen]
     return Verdict(predicted, parameters, (*notes, *_untested(model, judged, uncertainty)))
 
 
@@ -617,6 +619,23 @@ def _moving(finding: Finding) -> str:
     # A line leads nowhere that far.
     far = finding.turned_round or finding.kind == "rest"
     return f"{says}{text} ({chance})" + (f"; {effect}." if not far else ".")
+
+
+def _not_seen(finding: Finding) -> str:
+    """Note: what would not show in the data, and where it would move parameters."""
+    moved = [move for move in finding.moves if abs(move.deviations) > MOVED][:3]
+    by = ", ".join(
+        f"{m.quantity.name} by {abs(100.0 * m.change / m.quantity.value):.2g} %"
+        if m.quantity.value
+        else f"{m.quantity.name} by {sized(abs(m.change), m.quantity.unit, 2)}"
+        for m in moved
+    )
+    interval = "its interval" if len(moved) == 1 else "their intervals"
+    taken = moved[0].quantity.name if len(moved) == 1 else "these"
+    return (
+        f"These data would not show {description(finding)}. That would move {by}, far beyond "
+        f"{interval}, for the fit takes it for a part of {taken}. {finding.cure}"
+    )
 
 
 def _in_vain(finding: Finding, fitted: Alternative) -> str:

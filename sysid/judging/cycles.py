@@ -11,7 +11,14 @@ import numpy as np
 
 from sysid.arrays import FloatArray
 from sysid.judging.disturbed import DisturbedRun
-from sysid.judging.suspects import Suspect, of_terms, only, physical_equations, rows_of
+from sysid.judging.suspects import (
+    SPEEDS,
+    Suspect,
+    of_terms,
+    only,
+    physical_equations,
+    rows_of,
+)
 from sysid.problem.terms import AddedTerm
 
 _MOST_CYCLES = 40  # within the range of a position, or in a turn
@@ -21,7 +28,6 @@ _PROPORTIONAL = 1e-9
 # Cycles in the range of a position by which a period found is told more closely.
 _CLOSER = np.linspace(-0.3, 0.3, 13)
 _TURNS = {"rad": 2.0 * math.pi, "deg": 360.0}  # a turn of an angle in its unit
-_SPEEDS = ("rad/s", "deg/s", "m/s", "cm/s", "mm/s")
 _SEEN = 0.3  # deviation from an output, in parts of its own, up to which a speed is that output
 
 
@@ -103,7 +109,7 @@ def _ways(runs: Sequence[DisturbedRun]) -> Iterator[_Way]:
         yield _Way(states[position].name, states[position].unit, speed, along)
     for speed in physical:
         state = states[speed]
-        if speed not in placed and state.unit in _SPEEDS:
+        if speed not in placed and state.unit in SPEEDS:
             along = partial(_integral, speed)
             yield _Way(f"the integral of {state.name}", state.unit[:-2], speed, along, True)
 

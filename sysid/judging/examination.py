@@ -30,10 +30,14 @@ _BEYOND = 10.0  # times its range, to where a parameter is freed that stands on 
 
 @dataclass(frozen=True)
 class Suspicion:
-    """What a model may lack: findings of score tests, and a variant that was fitted for them."""
+    """What a model may lack: findings of score tests, and a variant that was fitted for them.
+
+    unseen: what may be there and would not be seen in these data.
+    """
 
     findings: tuple[Finding, ...]
     alternative: Alternative | None
+    unseen: tuple[Finding, ...] = ()
 
 
 def verdict_of(
@@ -72,6 +76,7 @@ def verdict_of(
         ),
         findings=None if suspicion is None else suspicion.findings,
         alternative=None if suspicion is None else suspicion.alternative,
+        unseen=() if suspicion is None else suspicion.unseen,
     )
 
 
@@ -141,12 +146,14 @@ def suspected(
             findings = missing(uncertainty)
     except ModelError:  # equations that cannot be added to, or a run that fails
         return None
+    unseen = tuple(f for f in findings if f.kind == "unseen")
+    findings = tuple(f for f in findings if f.kind != "unseen")
     findings = tuple(
         moved_by_noise(f, estimator, uncertainty, training) if f.kind == "noise" else f
         for f in findings
     )
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
-    return Suspicion(findings, fitted)
+    return Suspicion(findings, fitted, unseen)
 
 
 def score_tests_of(estimator: GASSI, training: Sequence[Dataset]) -> ScoreTests:

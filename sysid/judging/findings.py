@@ -43,7 +43,7 @@ class Finding:
     other shapes that it is like as well, between which fits decide. of_input: whether a channel is
     an input. p_value: by chance, all tests counted. share: of the whitened residuals' squares that
     it explains. moves: the farthest first. wider: how many times as wide the interval is that it
-    widens most.
+    widens most. cure: of what would not be seen, what would show it.
     """
 
     kind: Kind
@@ -57,6 +57,7 @@ class Finding:
     of_input: bool = False
     wider: float = 1.0
     rivals: tuple[AddedTerm, ...] = ()
+    cure: str = ""
 
     @property
     def farthest(self) -> float:
@@ -66,7 +67,8 @@ class Finding:
     @property
     def counts(self) -> bool:
         """Whether it moves a parameter noticeably, widens intervals, or is much of what is left."""
-        return self.farthest > MOVED or self.share > _LARGE or self.widens
+        seen = self.kind != "unseen"
+        return seen and (self.farthest > MOVED or self.share > _LARGE or self.widens)
 
     @property
     def widens(self) -> bool:
@@ -119,7 +121,7 @@ _SHAPES = {
 def description(finding: Finding) -> str:
     """A finding in a few words."""
     amplitude, unit = finding.amplitude, "" if finding.unit == "1" else finding.unit
-    if finding.kind == "variant":
+    if finding.kind in ("variant", "unseen"):
         return finding.name
     if finding.term is not None:
         return _term_text(finding.term)

@@ -18,6 +18,7 @@ from sysid.judging.whitener import Whitener
 from sysid.uncertainty.colour import record_rows
 
 _NEW = 1e-2  # share of a suspect that no change of the parameters makes, below which it is theirs
+_ROUNDING = 1e-9  # the same, which rounding makes
 _LAGS = 20  # of what colour whitening may leave
 
 
@@ -76,6 +77,18 @@ class Regression:
         if not new.any() or (one_sided and axes[0, 0] * score[0] <= 0.0):
             return math.inf
         return self._log_p(float(score @ score), int(new.sum()))
+
+    def deviation(self, changes: FloatArray) -> float:
+        """Standard deviation of a suspect's only amplitude, infinite where parameters do the same.
+
+        changes: (n_residuals, n_outputs, 1).
+        """
+        columns, size = self._scaled(changes)
+        if not columns.size:
+            return math.inf
+        new = float(np.linalg.norm(self._basis.split(columns)[1]))
+        variance = self.squares / max(self._left, 1)
+        return math.sqrt(variance) / (new * float(size[0])) if new > _ROUNDING else math.inf
 
     def _scaled(self, changes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened columns of unit length, those without any left out, and all their lengths."""

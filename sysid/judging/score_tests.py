@@ -15,7 +15,7 @@ probability is taken into the regression, and the rest asked again.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -34,6 +34,7 @@ from sysid.judging.cycles import cycle_suspects
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.feedback import answer_probability, answers
 from sysid.judging.findings import MOVED, Finding, Move, moves_of
+from sysid.judging.phrases import sized
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
     Suspect,
@@ -49,6 +50,7 @@ from sysid.judging.suspects import (
     rest_suspects,
     variant_suspects,
 )
+from sysid.judging.unseen import Possibility, possibilities
 from sysid.judging.whitener import Whitener
 from sysid.problem.terms import AddedTerm
 from sysid.threads import Workers
@@ -83,6 +85,10 @@ _FLAT = 0.999  # of what the best size of a delay explains, that is as good
 _SAME_RATE = 1e-3  # of a sample time
 _WHOLE = 0.2  # share by which a mean may seem to be longer or shorter than it is
 _NEARLY = 0.3  # of what the likeliest shape of a function explains, that a fit may turn round
+_SEEN = 4.2  # deviations of an amplitude by which it is found, as chance and number of tests ask
+# Deviations by which something unseen moves an estimate at least, to be told: five half widths; and
+# part by which it differs from what a parameter does, or it is that.
+_HIDDEN, _THE_SAME = 10.0, 1e-6
 _REACH = 10.0  # of a term's range in parts of the size that its test found
 # Standard deviation of a coordinate before the data: a factor of e; where an end of a range decides
 # its value, the data want it elsewhere, and nobody knows where.
@@ -147,15 +153,28 @@ class ScoreTests:
         return any(map(self._tests.are_significant, (self._named, self._functions)))
 
     def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
-        """What the model lacks, the surest first, and how far it moves what has intervals."""
-        if self._exact:
-            return ()
+        """What the model lacks, the surest first, and how far it moves what has intervals.
+
+        Where that is nothing that counts, behind it what may be there and would not be seen.
+        """
+        findings = () if self._exact else self._significant(uncertainty)
+        if self._exact or any(finding.counts for finding in findings):
+            return findings
+        tests = self._answered.of(uncertainty)
+        feedback = tests.feedback(self._runs)
+        # What an input answers later looks as if it were late.
+        rest = (f for f in findings if not (self._answering and f.comes_late))
+        unseen = () if feedback else tests.unseen(possibilities(self._runs, self._named))
+        return (*feedback, *rest, *unseen)
+
+    def _significant(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
+        """What is there by more than chance."""
         names, tests = self._runs[0].model.parameter_names, self._tests.of(uncertainty)
         alone = [e.name for e in uncertainty.determined() if e.name in names]
         changing = [*change_suspects(self._runs, alone)]
         # Among more suspects what is left to chance by itself is so all the more.
         if not self.suspicious and not tests.are_significant(changing):
-            return self._answered.of(uncertainty).feedback(self._runs)
+            return ()
         at_rest = list(rest_suspects(self._runs))
         if at_rest and tests.leads([*self._named, *changing, *self._functions], at_rest):
             tests.admit(at_rest, most=1)
@@ -163,12 +182,7 @@ class ScoreTests:
         tests.admit([*self._named, *changing])
         if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
             tests.admit(self._functions)
-        findings = tests.settled()
-        if any(finding.counts for finding in findings):
-            return findings
-        feedback = self._answered.of(uncertainty).feedback(self._runs)
-        # What an input answers later looks as if it were late.
-        return (*feedback, *(f for f in findings if not (self._answering and f.comes_late)))
+        return tests.settled()
 
     @cached_property
     def _functions(self) -> list[Suspect]:
@@ -243,6 +257,47 @@ class _Tests:
             return ()
         name = runs[0].model.input_names[place]
         return (Finding("feedback", name, "", 1.0, chance, 0.0, moves, of_input=True),)
+
+    def unseen(self, possibilities: Iterable[Possibility]) -> tuple[Finding, ...]:
+        """What may be there and would not be seen, and moves an estimate farthest, farthest first.
+
+        Each moves one farther than those before it do.
+        """
+        if self._local.corrects:  # what its innovations take up is not known
+            return ()
+        findings = [finding for p in possibilities if (finding := self._unseen(p)) is not None]
+        findings.sort(key=lambda finding: -finding.farthest)
+        farthest, chosen = dict[str, float](), list[Finding]()
+        for finding in findings:
+            sizes = {move.quantity.name: abs(move.deviations) for move in finding.moves}
+            if any(size > max(_HIDDEN, farthest.get(n, 0.0)) for n, size in sizes.items()):
+                chosen.append(finding)
+            farthest |= {n: max(size, farthest.get(n, 0.0)) for n, size in sizes.items()}
+        return tuple(chosen)
+
+    def _is_asked(self, quantity: Estimate) -> bool:
+        """Whether it is of the model's parameters, and no start of a state."""
+        names = self._local.objective.simulator.model.parameter_names
+        return quantity.combination is not None or quantity.name in names
+
+    def _unseen(self, possibility: Possibility) -> Finding | None:
+        """What a possibility would move while it is not seen; None of what a parameter does."""
+        changes = possibility.suspect.changes / self._scales[..., None]
+        flat, slopes = changes.ravel(), self._local.slopes.reshape(changes.size, -1)
+        sizes = np.linalg.norm(slopes, axis=0) * np.linalg.norm(flat)
+        alike = np.abs(flat @ slopes) > (1.0 - _THE_SAME) * np.where(sizes > 0.0, sizes, np.inf)
+        if not flat.any() or alike.any():
+            return None
+        amplitude = min(possibility.usual, _SEEN * self._regression.deviation(changes))
+        moved = self._moved_by(amplitude * changes[..., 0])
+        every = map(self._within_limits, moves_of(self._estimates, moved.tolist()))
+        moves = tuple(move for move in every if self._is_asked(move.quantity))
+        size = sized(amplitude * possibility.size, possibility.unit, 2)
+        text, suspect = possibility.words.format(size=size), possibility.suspect
+        unit, cure = suspect.unit, possibility.cure
+        return Finding(
+            "unseen", text, unit, amplitude, 1.0, 0.0, moves, of_input=suspect.of_input, cure=cure
+        )
 
     def answering(self, runs: Sequence[DisturbedRun]) -> list[int]:
         """Places of inputs that answer what outputs err by, by more than chance."""
@@ -561,7 +616,10 @@ class _Tests:
         """
         admitted = slice(self._ends[0], None)
         taken = changes @ result.amplitudes
-        taken = taken + self._columns[..., admitted] @ result.move[admitted]
+        return self._moved_by(taken + self._columns[..., admitted] @ result.move[admitted])
+
+    def _moved_by(self, taken: FloatArray) -> FloatArray:
+        """By how much each estimate moves where a fit takes such changes out of the residuals."""
         basis, triangle = self._fitted
         within = basis[: taken.size].T @ (taken / self._errors).ravel()
         moved: FloatArray = self._gradients @ -solve_triangular(triangle, within)

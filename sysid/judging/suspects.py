@@ -44,7 +44,10 @@ Kind = Literal[
     "fixed",
     "exchange",
     "feedback",
+    "unseen",
 ]
+
+SPEEDS = ("rad/s", "deg/s", "m/s", "cm/s", "mm/s")  # units of what turns or slides
 
 _PARTS = (0.5, 2.0)  # of a variant's further parameters
 _KNEE = 0.8  # share of a signal's peak from where its saturation is looked for
@@ -496,7 +499,7 @@ def of_terms(
 ) -> Suspect:
     """Functions of a signal (n_samples,) of each run, in equation i together."""
     state = runs[0].model.states[i]
-    columns = [_added(runs, i, partial(_along, term, signal), held=held) for term in terms]
+    columns = [added_rates(runs, i, partial(_along, term, signal), held=held) for term in terms]
     return Suspect("function", state.name, f"{state.unit}/s", np.stack(columns, axis=2), terms)
 
 
@@ -575,7 +578,7 @@ def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     ]
     for i in physical_equations(runs[0]):
         state = runs[0].model.states[i]
-        columns = [_added(runs, i, wave) for wave in waves]
+        columns = [added_rates(runs, i, wave) for wave in waves]
         yield Suspect("disturbance", state.name, f"{state.unit}/s", np.stack(columns, axis=2))
 
 
@@ -625,7 +628,7 @@ def rest_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             continue
         for i in physical_equations(runs[0]):
             along = [partial(_while_at_rest, u, j) for j in range(len(model.states))]
-            columns = np.stack([_added(runs, i, signal) for signal in along], axis=2)
+            columns = np.stack([added_rates(runs, i, signal) for signal in along], axis=2)
             name = f"d{model.states[i].name}/dt while {given.name} stands at 0"
             yield Suspect("rest", name, f"{model.states[i].unit}/s", columns, of_input=True)
 
@@ -723,7 +726,7 @@ def _signal(j: int, run: DisturbedRun) -> FloatArray:
     return run.states[:, j] if j < n else run.record.inputs[:, j - n]
 
 
-def _added(
+def added_rates(
     runs: Sequence[DisturbedRun],
     i: int,
     signal: Callable[[DisturbedRun], FloatArray],

@@ -1,0 +1,76 @@
+"""What no residual shows and moves parameters all the same is said, and only where it does."""
+
+import numpy as np
+import pytest
+
+from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
+from sysid.gassi import GASSI
+from sysid.judging.examination import verdict_of
+from tests.soak import mostly_soak
+
+INERTIA, VISCOUS, DRY, DT, N = 0.02, 0.006, 0.03, 0.01, 1500
+INERTIA_RANGE = Parameter("J", "kg*m^2", 0.034, 0.002, 0.2, "log")
+VISCOUS_RANGE = Parameter("B", "N*m*s/rad", 0.01, 6e-4, 0.06, "log")
+
+
+def rotor(derivative, *parameters):
+    return ProcessModel(
+        name="rotor",
+        states=(State("w", "rad/s", initial_range=(-200.0, 300.0)),),
+        inputs=(Input("T", "N*m"),),
+        outputs=(Output("w", "rad/s"),),
+        parameters=(INERTIA_RANGE, VISCOUS_RANGE, *parameters),
+        derivative=derivative,
+    )
+
+
+SMOOTH = rotor(lambda x, u, p: ((u[0] - p[1] * x[0]) / p[0],))
+RUBBING = rotor(
+    lambda x, u, p: ((u[0] - p[1] * x[0] - p[2] * (1.0 if x[0] > 0.0 else -1.0)) / p[0],),
+    Parameter("Tc", "N*m", 0.02, 0.001, 0.2, "log"),
+)
+
+
+def record(seed, place, dry, least=0.6):
+    """A rotor under levels of torque, from least to 1 N*m, with noise of 1 rad/s; exact."""
+    rng = np.random.default_rng([seed, place])
+    lengths = rng.integers(20, 120, N // 20)
+    torque = np.repeat(rng.uniform(least, 1.0, len(lengths)), lengths)[:N]
+    pole, w, y = np.exp(-VISCOUS / INERTIA * DT), (max(least, 0.0) + 0.2 - dry) / VISCOUS, []
+    for k in range(N):
+        y.append(w)
+        for _ in range(10):  # within which it may turn round
+            part = pole**0.1
+            w = part * w + (1.0 - part) * (torque[k] - dry * np.sign(w)) / VISCOUS
+    return Dataset(torque, np.array(y) + rng.standard_normal(N), DT, f"place {place}")
+
+
+def verdict_on(model, seed, *options):
+    records = [record(seed, place, *options) for place in (1, 2)]
+    fitted = GASSI(model, population=60, generations=14, random_state=seed).fit(records[0])
+    return verdict_of(fitted, records[:1], records[1:])
+
+
+def blind_spots(verdict):
+    return [note for note in verdict.notes if "would not show" in note]
+
+
+@pytest.mark.parametrize(("seed", "dry"), mostly_soak([(0, DRY), (0, 0.0), (3, DRY)], always=2))
+def test_friction_that_one_way_hides_is_said_with_what_it_would_move(seed, dry):
+    """4 % of the torque, and B is off by 60 half widths; whether it is there nothing tells."""
+    (note,) = blind_spots(verdict_on(SMOOTH, seed, dry))
+    assert note.startswith("These data would not show dry friction of w of up to ")
+    assert "mN*m. That would move B by " in note
+    assert note.endswith("w never turns round in them: a record that moves both ways tells.")
+
+
+def test_what_moves_both_ways_hides_no_friction():
+    verdict = verdict_on(SMOOTH, 0, 0.0, -1.0)
+    assert verdict.trust == "good", verdict.reasons
+    assert not blind_spots(verdict)
+
+
+def test_friction_that_the_model_has_is_not_missing():
+    """What it may be by data of one way its own interval says."""
+    notes = " ".join(blind_spots(verdict_on(RUBBING, 0, DRY)))
+    assert "dry friction" not in notes
