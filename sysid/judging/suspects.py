@@ -482,11 +482,13 @@ def function_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         for j, signal in enumerate(signals):
             together = np.concatenate([_signal(j, run) for run in runs])
             held = isinstance(signal, Input) and signal.hold == "zoh"
+            noise = np.concatenate([np.zeros(len(model.states)), runs[0].record.input_noise])
+            noisy = bool(noise[j])
             limit = _JUMPING_STATE if isinstance(signal, State) else _JUMPING
             if len(np.unique(together)) < _LEVELS or (_jumps(together, limit) and not held):
                 continue
             for terms in _terms(model.states[i].name, signal, together):
-                yield of_terms(runs, i, partial(_signal, j), terms, held=held)
+                yield of_terms(runs, i, partial(_signal, j), terms, held=held, noisy=noisy)
 
 
 def of_terms(
@@ -496,17 +498,28 @@ def of_terms(
     terms: tuple[AddedTerm, ...],
     *,
     held: bool = False,
+    noisy: bool = False,
 ) -> Suspect:
-    """Functions of a signal (n_samples,) of each run, in equation i together."""
+    """Functions of a signal (n_samples,) of each run, in equation i together.
+
+    Of a noisy one, whose noise errors go with, straight from mean to mean of two samples.
+    """
     state = runs[0].model.states[i]
-    columns = [added_rates(runs, i, partial(_along, term, signal), held=held) for term in terms]
+    columns = [
+        added_rates(runs, i, partial(_along, term, signal, held and noisy), held=held and not noisy)
+        for term in terms
+    ]
     return Suspect("function", state.name, f"{state.unit}/s", np.stack(columns, axis=2), terms)
 
 
 def _along(
-    term: AddedTerm, signal: Callable[[DisturbedRun], FloatArray], run: DisturbedRun
+    term: AddedTerm,
+    signal: Callable[[DisturbedRun], FloatArray],
+    evened: bool,
+    run: DisturbedRun,
 ) -> FloatArray:
-    return _values(term, signal(run))
+    values = _values(term, signal(run))
+    return 0.5 * (values + delayed(values)) if evened else values
 
 
 def _terms(

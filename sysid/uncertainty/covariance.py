@@ -172,17 +172,15 @@ def _score(
     weighted: slopes times weights; held: (n_free,), coordinates that were not fitted.
     """
     residual, fitted = sensitivity.residual, sensitivity.slopes
-    constant = [*zero_errors(sensitivity), *(change for _, change in start_errors(sensitivity))]
     if held is not None:
         fitted = fitted[..., ~held]
-    if constant:  # what stays the same is no slow noise
-        fitted = np.concatenate([fitted, np.stack(constant, axis=2)], axis=2)
     noise = colour(residual, sensitivity.seen, sensitivity.lengths, fitted)
     score = score_covariance(weighted, sensitivity.seen, sensitivity.lengths, noise)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
-    between = parabola_errors(sensitivity), averages_errors(sensitivity), bend_errors(sensitivity)
-    for errors in (constant, *between):
+    starts = (change for _, change in start_errors(sensitivity))
+    constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
+    for errors in (*constant, averages_errors(sensitivity), bend_errors(sensitivity)):
         score += _score_covariance_by(weighted, errors)
     pushes = np.array([*noise_pushes(sensitivity, weight, ties)])
     pushes = pushes.reshape(-1, weighted.shape[2])

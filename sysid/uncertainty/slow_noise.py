@@ -94,7 +94,8 @@ def regression_table(
     signal = np.where(seen, residual, 0.0)[:, None]
     if slopes is None:
         return signal
-    basis, sizes, _ = np.linalg.svd(np.where(seen[:, None], slopes, 0.0), full_matrices=False)
+    columns = np.column_stack([slopes, np.ones(len(slopes))])
+    basis, sizes, _ = np.linalg.svd(np.where(seen[:, None], columns, 0.0), full_matrices=False)
     return np.hstack([basis[:, sizes > _ROUNDING * sizes.max(initial=0.0)], signal])
 
 

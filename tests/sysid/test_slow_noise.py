@@ -129,7 +129,7 @@ def verdict_on(records, seed):
     return verdict_of(fitted, records[:1], records[1:])
 
 
-@pytest.mark.parametrize("seed", mostly_soak(list(range(8)), always=2))
+@pytest.mark.parametrize("seed", mostly_soak([3, 5, 7, 0, 1, 2, 4, 6], always=2))
 def test_a_random_walk_is_no_drift_and_nothing_that_changes(seed):
     """Seven of these eight had been laid to drifts, changes and slow signals, with p < 1e-9."""
     verdict = verdict_on([pushed_about(seed, place) for place in (1, 2)], seed)
