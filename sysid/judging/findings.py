@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from sysid.judging.phrases import sized
+from sysid.judging.phrases import either, sized
 from sysid.judging.suspects import Kind
 from sysid.problem.terms import AddedTerm
 from sysid.uncertainty import Estimate
@@ -43,7 +43,8 @@ class Finding:
     other shapes that it is like as well, between which fits decide. of_input: whether a channel is
     an input. p_value: by chance, all tests counted. share: of the whitened residuals' squares that
     it explains. moves: the farthest first. wider: how many times as wide the interval is that it
-    widens most. cure: of what would not be seen, what would show it.
+    widens most. cure: of what would not be seen, what would show it. alike: channels, of which the
+    same fault would look the same in these data.
     """
 
     kind: Kind
@@ -58,6 +59,7 @@ class Finding:
     wider: float = 1.0
     rivals: tuple[AddedTerm, ...] = ()
     cure: str = ""
+    alike: tuple[str, ...] = ()
 
     @property
     def farthest(self) -> float:
@@ -108,6 +110,7 @@ _WORDS = {
     "errors have a memory: the fit has taken part of the answer for the plant's",
     "exchange": "{name} have changed places in the log",
 }
+_FAULTS = {"gain": "the gain", "offset": "an offset", "drift": "a drift"}
 # What has no single amplitude.
 _SHAPES = {
     "rest": "another {name}, as behind a driver that opens between pulses: the model's equations "
@@ -119,7 +122,15 @@ _SHAPES = {
 
 
 def description(finding: Finding) -> str:
-    """A finding in a few words."""
+    """A finding in a few words, with what looks the same."""
+    text = _name_of(finding)
+    if not finding.alike:
+        return text
+    fault = f"{_FAULTS[finding.kind]} of {either(finding.alike)}"
+    return f"{text}, unless it is {fault}, which would look the same"
+
+
+def _name_of(finding: Finding) -> str:
     amplitude, unit = finding.amplitude, "" if finding.unit == "1" else finding.unit
     if finding.kind in ("variant", "unseen"):
         return finding.name

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # Not before a power, which would raise the prefix too: 1 mm^2 is not 1e-3 m^2.
@@ -31,6 +32,15 @@ def change(old: float, new: float, unit: str) -> str:
     factor, multiple = _multiple(old if _FAR * abs(old) > abs(new) else new, unit)
     before, after = (_number(factor * value, digits) for value in (old, new))
     return f"{before} -> {after} {multiple}".rstrip()
+
+
+def either(names: Sequence[str]) -> str:
+    """Names of which one is meant.
+
+    >>> either(["load", "voltage", "omega"])
+    'load, voltage or omega'
+    """
+    return " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def _number(value: float, digits: int) -> str:

@@ -17,6 +17,7 @@ from sysid.uncertainty.estimate import Z95
 _LAGS = 20  # at which two outputs' residuals are compared
 # Deviations of chance beyond which the largest of so many correlations is none of it.
 _SURE = 4.5
+_LIKELY = 1.5  # deviations of chance beyond which something else is there as well
 _EXPECTED = 0.5  # of a residual's deviation, from where what a right model leaves may explain it
 # Robust deviations from its neighbours at which an error stands alone, the share of such that does
 # little harm (Student's noise of four degrees of freedom has 0.3 %), and the chance of more.
@@ -54,15 +55,19 @@ def errors_by_speed(
     where chance explains it, or what a right model leaves.
     """
     trend = np.zeros(residual.shape[1])
-    # Since the sample before: what comes after may answer the error.
-    rates = np.abs(np.diff(simulated, axis=0, prepend=simulated[:1]))
+    rates = np.abs(np.gradient(simulated, axis=0))
+    past = np.abs(np.diff(simulated, axis=0, prepend=simulated[:1]))
     for j in np.flatnonzero(~_explained(residual, systematic)):
         seen = np.isfinite(residual[:, j])
         errors, speeds = np.abs(residual[seen, j]), rates[seen, j]
-        if seen.sum() < 50 or not np.ptp(errors) or not np.ptp(speeds):
+        if seen.sum() < 50 or not all(map(np.ptp, (errors, speeds, past[seen, j]))):
             continue
-        correlation = float(np.corrcoef(_ranks(errors), _ranks(speeds))[0, 1])
-        trend[j] = correlation if correlation > _SURE / np.sqrt(seen.sum()) else 0.0
+        ranks, chance = _ranks(errors), 1.0 / np.sqrt(seen.sum())
+        correlation = float(np.corrcoef(ranks, _ranks(speeds))[0, 1])
+        # What comes after an error may answer it, as under feedback; what was before does not.
+        before = float(np.corrcoef(ranks, _ranks(past[seen, j]))[0, 1])
+        sure = correlation > _SURE * chance and before > _LIKELY * chance
+        trend[j] = correlation if sure else 0.0
     return trend
 
 

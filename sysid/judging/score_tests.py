@@ -69,10 +69,12 @@ _LOG_SURE = np.log(1e-9)  # from where on it does not matter how small it is
 # Have no single amplitude.
 _SEVERAL = ("variant", "bend", "function", "curve", "disturbance", "rest")
 _SLOW = ("delay", "filter", "lag")
+_SCALES = ("gain", "offset", "drift")  # of a channel
 _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
 _HALF = 0.5  # of the residuals' squares, which other equations at rest leave at most, to be named
+_SAME = 0.1  # of what one explains, up to which what another does differs from it and is the same
 _AS_LATE = 0.8  # of what one explains that is early, that counts for as much where it is late
 _LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
 _FEW = 25  # samples for each amplitude, below which what they leave tells no colour
@@ -126,17 +128,18 @@ class ScoreTests:
         held = of_filter(local) if filtered else of_free_runs(local, records)
         local, runs, background = held
         self._runs, self._tests = runs, _Tests(local, background, runs[0].workers)
-        self._answered, self._answering = self._tests, self._tests.answering(runs)
+        channels = list(channel_suspects(runs))
+        self._answered, self._answering = self._tests, self._tests.answering(runs, channels)
         if self._answering:
             # What an input answers at once goes with what it would do if it were late.
             q, lengths = local.residual.shape[1], local.lengths
             signals = np.concatenate([run.measured for run in runs])
-            later = [answers(signals[:, i], lengths, q) for i in self._answering]
+            places = map(runs[0].model.input_names.index, self._answering)
+            later = [answers(signals[:, i], lengths, q) for i in places]
             foreseen = np.concatenate([background.foreseen, *later], axis=2)
             background = replace(background, foreseen=foreseen)
             self._tests = _Tests(local, background, runs[0].workers)
         noisy = [runs[0].model.input_names[i] for i in np.flatnonzero(records[0].input_noise)]
-        channels = list(channel_suspects(runs))
         # Noise of an input makes its gain look smaller, and play takes it off: that is no fault.
         # Of averages the noise left is as slow as what a delay changes in them.
         of_noise = ("gain", "play", *(_SLOW if filtered else ()))
@@ -161,7 +164,7 @@ class ScoreTests:
         if self._exact or any(finding.counts for finding in findings):
             return findings
         tests = self._answered.of(uncertainty)
-        feedback = tests.feedback(self._runs)
+        feedback = tests.feedback(self._answering)
         # What an input answers later looks as if it were late.
         rest = (f for f in findings if not (self._answering and f.comes_late))
         unseen = () if feedback else tests.unseen(possibilities(self._runs, self._named))
@@ -241,22 +244,20 @@ class _Tests:
         tests._gradients = np.array(gradients).reshape(-1, self._local.slopes.shape[2])
         return tests
 
-    def feedback(self, runs: Sequence[DisturbedRun]) -> tuple[Finding, ...]:
-        """The input that answers what outputs err by, where that has moved an estimate."""
-        if self._local.corrects:  # a filter's innovations are new
+    def feedback(self, answering: Mapping[str, float]) -> tuple[Finding, ...]:
+        """The input that answers what outputs err by, where that has moved an estimate.
+
+        answering: probabilities as of ``answering``.
+        """
+        if not answering:
             return ()
         coefficients = self._regression.coefficients
         moved = self._gradients @ coefficients[: self._gradients.shape[1]]
         moves = tuple(map(self._within_limits, moves_of(self._estimates, moved.tolist())))
         if not moves or abs(moves[0].deviations) < MOVED:
             return ()
-        chances = self._chances(runs)
-        place = min(chances, key=lambda i: chances[i], default=0)
-        chance = len(chances) * chances.get(place, 1.0)
-        if chance > _BY_CHANCE:
-            return ()
-        name = runs[0].model.input_names[place]
-        return (Finding("feedback", name, "", 1.0, chance, 0.0, moves, of_input=True),)
+        name = min(answering, key=lambda each: answering[each])
+        return (Finding("feedback", name, "", 1.0, answering[name], 0.0, moves, of_input=True),)
 
     def unseen(self, possibilities: Iterable[Possibility]) -> tuple[Finding, ...]:
         """What may be there and would not be seen, and moves an estimate farthest, farthest first.
@@ -299,20 +300,26 @@ class _Tests:
             "unseen", text, unit, amplitude, 1.0, 0.0, moves, of_input=suspect.of_input, cure=cure
         )
 
-    def answering(self, runs: Sequence[DisturbedRun]) -> list[int]:
-        """Places of inputs that answer what outputs err by, by more than chance."""
-        chances = {} if self._local.corrects else self._chances(runs)
-        return [i for i, chance in chances.items() if len(chances) * chance < _BY_CHANCE]
+    def answering(
+        self, runs: Sequence[DisturbedRun], channels: Sequence[Suspect]
+    ) -> dict[str, float]:
+        """Inputs that answer what outputs err by, with the probabilities that this is chance.
 
-    def _chances(self, runs: Sequence[DisturbedRun]) -> dict[int, float]:
-        """Probabilities, by the inputs' places, that they answer errors by chance alone."""
+        Not those whose noise outputs err by: what is logged next tells more of it, and looks alike.
+        """
+        if self._local.corrects:  # a filter's innovations are new
+            return {}
         rest = self._residual - self._columns @ self._regression.coefficients
         white = self._regression.whitening.in_time(np.where(self._local.seen, rest, 0.0))
         signals = np.concatenate([run.measured for run in runs])
-        return {
-            i: answer_probability(white, signals[:, i], self._local.lengths)
-            for i in np.flatnonzero(runs[0].record.input_noise == 0.0).tolist()
-        }
+        exact = np.flatnonzero(runs[0].record.input_noise == 0.0).tolist()
+        lengths, answering = self._local.lengths, dict[str, float]()
+        for i, name in ((i, runs[0].model.input_names[i]) for i in exact):
+            chance = len(exact) * answer_probability(white, signals[:, i], lengths)
+            noises = [s for s in channels if s.kind == "noise" and s.name == name]
+            if chance < _BY_CHANCE and not self.are_significant(noises):
+                answering[name] = chance
+        return answering
 
     def are_significant(self, suspects: Sequence[Suspect]) -> bool:
         """Whether any of the suspects is there by more than chance, before any is admitted."""
@@ -383,7 +390,14 @@ class _Tests:
                 if i != surest and suspects[i].shares_place(suspect)
             ]
             moves = [self._moved(changes[surest], result), *alone, *shapes]
-            self.findings.append(self._finding(suspect, result, moves, logs[surest], terms))
+            same = [
+                suspects[i].name
+                for i in significant
+                if suspect.kind in _SCALES and suspects[i].kind == suspect.kind
+                if i != surest and self._leave_the_same(results[i][1], residual)
+            ]
+            finding = self._finding(suspect, result, moves, logs[surest], terms)
+            self.findings.append(replace(finding, alike=tuple(same)))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -391,6 +405,11 @@ class _Tests:
             self._ends.append(len(self._free))
             self._recolour(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
+
+    def _leave_the_same(self, residual: FloatArray, another: FloatArray) -> bool:
+        """Whether two suspects, by what each leaves, (n, n_outputs), explain the same."""
+        before = self._residual - self._columns @ self._regression.coefficients
+        return self._squares(residual - another) < _SAME**2 * self._squares(before - another)
 
     def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
         """Whether it is a fault by its size.

@@ -17,6 +17,7 @@ from scipy.linalg import lapack
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.uncertainty.slow_noise import (
+    PARAMETERS,
     SlowFilter,
     SlowNoise,
     regression_table,
@@ -74,18 +75,23 @@ def colour(
     order = _largest_order(whole, lengths, 1)
     parts = [None] * q if slopes is None else list(np.moveaxis(slopes, 1, 0))
     tables = list(map(regression_table, residual.T, seen.T, parts))
-    slow = tuple(slow_noise(*pair, lengths, order) for pair in zip(tables, seen.T, strict=True))
-    if not order or not any(slow):
+    hidden = [slow_noise(*pair, lengths, order) for pair in zip(tables, seen.T, strict=True)]
+    if not order or not any(hidden):
         return plain
-    filtered, sizes = residual.copy(), 0.0
+    slow = tuple(None if each is None else each.noise for each in hidden)
+    without, filtered, sizes = residual.copy(), residual.copy(), 0.0
     filters = Autoregression(plain.coefficients, plain.noise, slow).filters(seen, lengths)
-    for j, kalman in filters.items():
-        filtered[:, j] = remainder(kalman.innovations(tables[j]))[0]
-        sizes += 2.0 * float(np.sum(np.log(kalman.sizes)))
+    for j, each in enumerate(hidden):
+        if each is not None:
+            without[:, j] = each.without
+            filtered[:, j] = remainder(filters[j].innovations(tables[j]))[0]
+            sizes += 2.0 * float(np.sum(np.log(filters[j].sizes)))
     beside = _autoregression(filtered, whole, lengths)
-    criterion = beside.criterion + sizes + 2.0 * len(filters) * math.log(len(residual))
-    beside = replace(beside, slow=slow, deviance=beside.deviance + sizes, criterion=criterion)
-    return min(plain, beside, key=lambda model: model.criterion)
+    criterion = beside.criterion + sizes + PARAMETERS * len(filters) * math.log(len(residual))
+    # What looks like a slow part of an output by itself may be what the outputs' noises share.
+    if _autoregression(without, whole, lengths).criterion <= criterion:
+        return plain
+    return replace(beside, slow=slow, deviance=beside.deviance + sizes, criterion=criterion)
 
 
 def _autoregression(

@@ -29,7 +29,8 @@ from sysid.arrays import BoolArray, FloatArray, IntArray
 
 _FASTEST = 0.5  # samples that the zero's response takes to decay, at least
 _STEPS = (4.0, 2.0, math.sqrt(2.0), 2.0**0.25)  # of time constants that are tried, ever finer
-_PARAMETERS = 2
+PARAMETERS = 4  # that a slow part counts for: two, of which one is nothing without the other
+_REFITS = 10  # until noise and what a fit by its colour leaves agree
 _ALIKE = 1.0  # of a criterion, that tells a memory from a longer one: a deviation
 _ROUNDING = 1e-9  # singular value in parts of the largest
 _SETTLED = 1e-14  # part of a variance that it changes from sample to sample, below which it rests
@@ -46,6 +47,14 @@ class SlowNoise:
     def amplification(self) -> float:
         """Spectrum at frequency zero in parts of what it is at high ones, nearly."""
         return ((1.0 - self.zero) / (1.0 - self.pole)) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """A slow part, and what a fit would leave of the residuals, (n,), if there were none."""
+
+    noise: SlowNoise
+    without: FloatArray
 
 
 @dataclass(frozen=True)
@@ -104,14 +113,21 @@ def remainder(table: FloatArray) -> tuple[FloatArray, float]:
     columns, signal = table[:, :-1], table[:, -1]
     if not columns.size:
         return signal, 0.0
-    gram = columns.T @ columns
-    left = signal - columns @ np.linalg.lstsq(gram, columns.T @ signal, rcond=None)[0]
-    return left, float(np.linalg.slogdet(gram)[1])
+    left = signal - columns @ _amplitudes(table)
+    return left, float(np.linalg.slogdet(columns.T @ columns)[1])
+
+
+def _amplitudes(table: FloatArray) -> FloatArray:
+    """By which the last of columns (n, k + 1) is nearest to the sum of the others, (k,)."""
+    columns = table[:, :-1]
+    gram, within = columns.T @ columns, columns.T @ table[:, -1]
+    amplitudes: FloatArray = np.linalg.lstsq(gram, within, rcond=None)[0]
+    return amplitudes
 
 
 def slow_noise(
     table: FloatArray, seen: BoolArray, lengths: Sequence[int], order: int
-) -> SlowNoise | None:
+) -> Hidden | None:
     """The slow part of an output's residuals; None where an autoregression tells as much.
 
     table: (n, k + 1), as of ``regression_table``. order: the highest of the autoregression of what
@@ -124,17 +140,50 @@ def slow_noise(
         return None
     begins, freedom = _first_rows(lengths), table.shape[1] - 1
 
-    def criterion(pole_time: float, zero_time: float) -> float:
+    def filtered(pole_time: float, zero_time: float) -> tuple[FloatArray, FloatArray]:
         pole, zero = math.exp(-1.0 / pole_time), math.exp(-1.0 / zero_time)
         gains, sizes = _gains(pole, zero, seen, begins)
-        left, volume = remainder(_innovations(table, begins, pole, gains, sizes))
+        return _innovations(table, begins, pole, gains, sizes), sizes
+
+    def criterion(pole_time: float, zero_time: float) -> float:
+        columns, sizes = filtered(pole_time, zero_time)
+        left, volume = remainder(columns)
         return _criterion(left, sizes, begins, order, freedom) + volume
 
-    plain = _criterion(remainder(table)[0], np.ones(len(table)), begins, order, freedom)
-    best, pole_time, zero_time = _lowest(criterion, float(max(lengths)), plain)
-    if best + _PARAMETERS * math.log(max(int(seen.sum()), 2)) >= plain:
+    plain, without = _restricted(table, np.ones(len(table)), begins, order)
+    _, pole_time, zero_time = _lowest(criterion, float(max(lengths)), plain)
+    if not pole_time:
         return None
-    return SlowNoise(math.exp(-1.0 / pole_time), math.exp(-1.0 / zero_time))
+    best, _ = _restricted(*filtered(pole_time, zero_time), begins, order)
+    if best + PARAMETERS * math.log(max(int(seen.sum()), 2)) >= plain:
+        return None
+    return Hidden(SlowNoise(math.exp(-1.0 / pole_time), math.exp(-1.0 / zero_time)), without)
+
+
+def _restricted(
+    table: FloatArray, sizes: FloatArray, begins: IntArray, order: int
+) -> tuple[float, FloatArray]:
+    """Schwarz's criterion of the best autoregression of what columns (n, k + 1) leave of the last.
+
+    And what they leave, (n,). They take out of it what a fit would whose errors are whitened by
+    that autoregression: of slow noise a fit by squares leaves less than there was, and that is less
+    slow. sizes: (n,), that columns are in.
+    """
+    n, freedom = len(table), table.shape[1] - 1
+    table, lowest = np.ascontiguousarray(table), math.inf
+    left = remainder(table)[0]
+    for _ in range(_REFITS):
+        turns = _turns(left, begins, order)
+        whitened, logs = _whitened(table, turns, begins)
+        rest, volume = remainder(whitened)
+        variance = float(rest @ rest) / n
+        if variance <= 0.0:
+            return -math.inf, left
+        logs += (n - freedom) * math.log(variance) + len(turns) * math.log(n) + volume
+        if logs > lowest - _ALIKE:
+            break
+        lowest, left = logs, table[:, -1] - table[:, :-1] @ _amplitudes(whitened)
+    return lowest + 2.0 * float(np.sum(np.log(sizes))), left
 
 
 _Criterion = Callable[[float, float], float]
@@ -284,3 +333,62 @@ def _products(signal: FloatArray, begins: IntArray, order: int) -> FloatArray:
                 total += signal[t] * signal[t - lag]
             sums[lag] += total
     return sums
+
+
+@njit(cache=True, nogil=True)
+def _turns(signal: FloatArray, begins: IntArray, order: int) -> FloatArray:
+    """Reflection coefficients of the autoregression of a signal (n,) that Schwarz prefers.
+
+    By Burg's recursion, which takes nothing for zero beyond the ends: of a slow signal that is a
+    step. See Kay, "Modern Spectral Estimation", 1988.
+    """
+    n, ahead, behind = len(signal), signal.copy(), signal.copy()
+    turns, best = np.zeros(order), 0
+    variance = np.sum(signal * signal) / n
+    least = n * math.log(max(variance, 1e-300))
+    for k in range(order):
+        product, squares = 0.0, 0.0
+        for record in range(len(begins) - 1):
+            for t in range(begins[record] + k + 1, begins[record + 1]):
+                product += ahead[t] * behind[t - 1]
+                squares += ahead[t] ** 2 + behind[t - 1] ** 2
+        turn = 2.0 * product / squares if squares > 0.0 else 0.0
+        for record in range(len(begins) - 1):
+            for t in range(begins[record + 1] - 1, begins[record] + k, -1):
+                forward = ahead[t]
+                ahead[t] -= turn * behind[t - 1]
+                behind[t] = behind[t - 1] - turn * forward
+        turns[k] = turn
+        variance *= max(1.0 - turn * turn, 1e-15)
+        criterion = n * math.log(max(variance, 1e-300)) + (k + 1) * math.log(n)
+        if criterion < least:
+            best, least = k + 1, criterion
+    return turns[:best]
+
+
+@njit(cache=True, nogil=True)
+def _whitened(signals: FloatArray, turns: FloatArray, begins: IntArray) -> tuple[FloatArray, float]:
+    """Signals (n, k) whitened from a first sample on, and the logarithm of what that divides by.
+
+    By a lattice of these reflection coefficients; squares of the scales of the first samples, which
+    are foreseen from few, as the process has them.
+    """
+    n, count = signals.shape
+    order, white, logs = len(turns), np.zeros((n, count)), 0.0
+    behind, before = np.zeros((order + 1, count)), np.zeros((order + 1, count))
+    for record in range(len(begins) - 1):
+        for t in range(begins[record], begins[record + 1]):
+            deep, scale = min(t - begins[record], order), 1.0
+            for k in range(deep, order):
+                scale /= max(1.0 - turns[k] ** 2, 1e-15)
+            if deep < order:
+                logs += math.log(scale)
+            for i in range(count):
+                forward = signals[t, i]
+                behind[0, i] = forward
+                for k in range(deep):
+                    behind[k + 1, i] = before[k, i] - turns[k] * forward
+                    forward -= turns[k] * before[k, i]
+                white[t, i] = forward / math.sqrt(scale)
+            behind, before = before, behind
+    return white, logs

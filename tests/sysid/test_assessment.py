@@ -541,7 +541,7 @@ def test_errors_that_grow_with_the_rate_of_change_are_no_sensors():
     def jittered(seed, jitter, passed_on=0.0):
         data = record(seed)
         smooth = lfilter([0.1], [1.0, -0.9], data.inputs, axis=0)
-        rng, rates = np.random.default_rng([seed, 5]), np.diff(smooth, axis=0, prepend=0.0)
+        rng, rates = np.random.default_rng([seed, 5]), np.gradient(smooth, axis=0)
         errors = NOISE * rng.standard_normal((N, 2))
         errors += jitter * rng.standard_normal((N, 2)) * rates
         data = replace(data, outputs=smooth + errors)

@@ -6,6 +6,7 @@ The plants are those of ``benchmarks.stress``, simulated by a scheme of their ow
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +45,7 @@ CASES = {case.name: case for case in cases()}
     mostly_soak(
         [
             ("sign of the current", "current has the opposite sign"),
-            ("load half", "load is 1.9"),
+            ("load half", "is 1.9"),
             ("speed through a filter", "omega is logged through a filter of 8"),
             ("load ten samples late", "load is logged 20"),
             ("speed clipped at 80 %", "omega saturates near its largest values"),
@@ -60,9 +61,22 @@ def test_what_is_wrong_is_named_with_its_size(name, words):
     assert words in said
 
 
+@pytest.mark.parametrize(
+    ("name", "wrong"), mostly_soak([("load half", "load"), ("current 1.3 times", "current")])
+)
+def test_a_gain_is_of_any_channel_where_data_do_not_tell_of_which(name, wrong):
+    """With half the inertia and twice R and L a load of half its size is a current of twice its."""
+    said = " ".join(tried(CASES[name], 0).verdict.parameters.reasons)
+    first = re.search(r"(\w+) is [\d.]+ times what the model has", said)
+    same = re.search(r"unless it is the gain of ([\w, ]+), which would look the same", said)
+    assert first is not None and same is not None, said
+    assert wrong in (first[1], *re.split(", | or ", same[1]))
+
+
 def test_an_offset_is_no_colour_of_the_residuals():
     """Its mean is eight times what the noise scatters: whitened as noise it would be gone."""
     outcome = tried(CASES["current 0.3 A off"], 4)
+    assert outcome.moved
     assert outcome.verdict.parameters.reasons[0].startswith("current is 0.3 A off")
 
 
@@ -615,7 +629,7 @@ def verdict_on_levels(*noise, seed):
 def test_noise_of_levels_that_makes_intervals_too_narrow_is_named():
     """What a slow plant makes of it is hidden below its sensor's noise, and sways estimates.
 
-    In half of the records: in the others the slow part of the residuals tells as much.
+    Where the residuals show that it is slow, as of most records, intervals count it by themselves.
     """
     verdict = verdict_on_levels(0.04, seed=2)
     assert verdict.predicted.trust == "good"

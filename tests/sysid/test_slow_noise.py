@@ -79,7 +79,7 @@ def test_what_an_autoregression_of_few_samples_tells_has_no_slow_part():
         assert slow_noise(lfilter([1.0], poles, white)[:, None], seen, [n], 12) is None
     hidden = slow_noise((white + first_order(rng, n, 200.0) / 3.0)[:, None], seen, [n], 12)
     assert hidden is not None
-    assert 50.0 < -1.0 / np.log(hidden.pole) < 800.0
+    assert 50.0 < -1.0 / np.log(hidden.noise.pole) < 800.0
 
 
 @pytest.mark.parametrize("samples", [60.0, 200.0, 600.0])
