@@ -12,7 +12,7 @@ import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
 from sysid.engine.trace import rates_along
-from sysid.judging.disturbed import DisturbedRun, Rates
+from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.suspects import SPEEDS, Suspect, added_rates, physical_equations
 
 # Dry friction in parts of the largest that acts on a speed, and offsets in parts of a channel's
@@ -92,16 +92,17 @@ def _acting(runs: Sequence[DisturbedRun], i: int) -> float:
     """Root mean square of the largest of the terms that parameters have in an equation."""
     sizes = [0.0]
     for place in range(len(runs[0].vector)):
-        squares = [_term(run, place).after[:, i] ** 2 for run in runs]
+        squares = [_term(run, place)[:, i] ** 2 for run in runs]
         sizes.append(float(np.sqrt(np.mean(np.concatenate(squares)))))
     return max(size for size in sizes if np.isfinite(size))
 
 
-def _term(run: DisturbedRun, place: int) -> Rates:
+def _term(run: DisturbedRun, place: int) -> FloatArray:
     """What a parameter, by its place, contributes to the rates, were these in proportion to it."""
     moved = run.vector.copy()
     moved[place] *= 1.0 + _PROBE
-    return (run.rates_of(run.model.derivative, moved) - run.rates) * (1.0 / _PROBE)
+    rates = rates_along(run.model.derivative, run.states, run.record.inputs, moved)
+    return (rates - run.rates.after) / _PROBE
 
 
 def _rubs(runs: Sequence[DisturbedRun], i: int) -> bool:

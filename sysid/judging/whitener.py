@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.uncertainty.colour import Autoregression, colour, record_rows
+from sysid.uncertainty.colour import Autoregression, colour, fast_colour, record_rows
 from sysid.uncertainty.sensitivity import Sensitivity
 from sysid.uncertainty.slow_noise import SlowFilter
 
@@ -167,8 +167,9 @@ def _is_straight(
     residual: FloatArray, line: FloatArray, seen: BoolArray, lengths: tuple[int, ...]
 ) -> bool:
     """Whether lines through an output's residuals, (n, 1), are more than slow noise makes of it."""
-    if not line.any():
-        return False
-    about, whole = (colour(e, seen, lengths).criterion for e in (residual - line, residual))
     lines = _OF_A_LINE * len(lengths) * math.log(max(len(residual), 2))
-    return about + lines < whole
+    # Beside slow noise a line is worth no more than it is without, and that is sooner asked.
+    return bool(line.any()) and all(
+        of(residual - line, seen, lengths).criterion + lines < of(residual, seen, lengths).criterion
+        for of in (fast_colour, colour)
+    )

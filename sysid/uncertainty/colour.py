@@ -65,13 +65,10 @@ def colour(
     seen: (n, q), which samples were measured; only equations without a lost one count. slopes: (n,
     q, p), of the fit that has left them.
     """
-    q = residual.shape[1]
-    whole = np.all(seen[:, seen.any(axis=0)], axis=1)
+    plain, whole = fast_colour(residual, seen, lengths), _whole(seen)
     if not whole.any():
-        # Outputs that are never measured together: of each its own variance.
-        variance = np.sum(residual**2, axis=0) / np.maximum(seen.sum(axis=0), 1)
-        return Autoregression(np.zeros((0, q, q)), np.diag(variance))
-    plain = _autoregression(residual, whole, lengths)
+        return plain
+    q = residual.shape[1]
     order = _largest_order(whole, lengths, 1)
     parts = [None] * q if slopes is None else list(np.moveaxis(slopes, 1, 0))
     tables = list(map(regression_table, residual.T, seen.T, parts))
@@ -92,6 +89,22 @@ def colour(
     if _autoregression(without, whole, lengths).criterion <= criterion:
         return plain
     return replace(beside, slow=slow, deviance=beside.deviance + sizes, criterion=criterion)
+
+
+def fast_colour(residual: FloatArray, seen: BoolArray, lengths: Sequence[int]) -> Autoregression:
+    """As of ``colour``, of noise that has no slow part."""
+    q, whole = residual.shape[1], _whole(seen)
+    if whole.any():
+        return _autoregression(residual, whole, lengths)
+    # Outputs that are never measured together: of each its own variance.
+    variance = np.sum(residual**2, axis=0) / np.maximum(seen.sum(axis=0), 1)
+    return Autoregression(np.zeros((0, q, q)), np.diag(variance))
+
+
+def _whole(seen: BoolArray) -> BoolArray:
+    """Samples, (n,), at which no output is lost that is measured at all."""
+    whole: BoolArray = np.all(seen[:, seen.any(axis=0)], axis=1)
+    return whole
 
 
 def _autoregression(

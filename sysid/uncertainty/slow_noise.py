@@ -121,8 +121,7 @@ def _amplitudes(table: FloatArray) -> FloatArray:
     """By which the last of columns (n, k + 1) is nearest to the sum of the others, (k,)."""
     columns = table[:, :-1]
     gram, within = columns.T @ columns, columns.T @ table[:, -1]
-    amplitudes: FloatArray = np.linalg.lstsq(gram, within, rcond=None)[0]
-    return amplitudes
+    return np.asarray(np.linalg.lstsq(gram, within, rcond=None)[0], dtype=np.float64)
 
 
 def slow_noise(
