@@ -17,7 +17,8 @@ from sysid.uncertainty.estimate import Z95
 _LAGS = 20  # at which two outputs' residuals are compared
 # Deviations of chance beyond which the largest of so many correlations is none of it.
 _SURE = 4.5
-_LIKELY = 1.5  # deviations of chance beyond which something else is there as well
+# Deviations of chance, and part of another correlation, beyond which one is there as well.
+_LIKELY, _PART = 1.5, 0.2
 _EXPECTED = 0.5  # of a residual's deviation, from where what a right model leaves may explain it
 # Robust deviations from its neighbours at which an error stands alone, the share of such that does
 # little harm (Student's noise of four degrees of freedom has 0.3 %), and the chance of more.
@@ -66,7 +67,7 @@ def errors_by_speed(
         correlation = float(np.corrcoef(ranks, _ranks(speeds))[0, 1])
         # What comes after an error may answer it, as under feedback; what was before does not.
         before = float(np.corrcoef(ranks, _ranks(past[seen, j]))[0, 1])
-        sure = correlation > _SURE * chance and before > _LIKELY * chance
+        sure = correlation > _SURE * chance and before > max(_LIKELY * chance, _PART * correlation)
         trend[j] = correlation if sure else 0.0
     return trend
 

@@ -29,7 +29,7 @@ from sysid.arrays import BoolArray, FloatArray, IntArray
 
 _FASTEST = 0.5  # samples that the zero's response takes to decay, at least
 _STEPS = (4.0, 2.0, math.sqrt(2.0), 2.0**0.25)  # of time constants that are tried, ever finer
-PARAMETERS = 4  # that a slow part counts for: two, of which one is nothing without the other
+PARAMETERS = 2  # that a slow part counts for
 _REFITS = 10  # until noise and what a fit by its colour leaves agree
 _ALIKE = 1.0  # of a criterion, that tells a memory from a longer one: a deviation
 _ROUNDING = 1e-9  # singular value in parts of the largest
