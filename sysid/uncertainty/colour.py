@@ -65,15 +65,14 @@ def colour(
     seen: (n, q), which samples were measured; only equations without a lost one count. slopes: (n,
     q, p), of the fit that has left them.
     """
-    plain, whole = fast_colour(residual, seen, lengths), _whole(seen)
-    if not whole.any():
+    plain, whole, q = fast_colour(residual, seen, lengths), _whole(seen), residual.shape[1]
+    order = _largest_order(whole, lengths, 1) if whole.any() else 0
+    if not order:
         return plain
-    q = residual.shape[1]
-    order = _largest_order(whole, lengths, 1)
     parts = [None] * q if slopes is None else list(np.moveaxis(slopes, 1, 0))
     tables = list(map(regression_table, residual.T, seen.T, parts))
     hidden = [slow_noise(*pair, lengths, order) for pair in zip(tables, seen.T, strict=True)]
-    if not order or not any(hidden):
+    if not any(hidden):
         return plain
     slow = tuple(None if each is None else each.noise for each in hidden)
     without, filtered, sizes = residual.copy(), residual.copy(), 0.0

@@ -130,10 +130,11 @@ def slow_noise(
     """The slow part of an output's residuals; None where an autoregression tells as much.
 
     table: (n, k + 1), as of ``regression_table``. order: the highest of the autoregression of what
-    is left. By Schwarz's criterion, with autoregressions by their correlations, of the likelihood
-    of what no fit can take out (restricted maximum likelihood; Patterson & Thompson, "Recovery of
-    inter-block information when block sizes are unequal", Biometrika 58, 1971): where slopes are
-    slow, a fit has taken most of a slow noise. Of memories that it hardly tells apart the longest.
+    is left. By Schwarz's criterion of the likelihood of what no fit can take out (restricted
+    maximum likelihood; Patterson & Thompson, "Recovery of inter-block information when block sizes
+    are unequal", Biometrika 58, 1971): where slopes are slow, a fit has taken most of a slow noise.
+    It is sought with autoregressions by their correlations, quickly; of memories that these hardly
+    tell apart the longest is taken.
     """
     if not table[:, -1].any():
         return None
@@ -173,15 +174,16 @@ def _restricted(
     left = remainder(table)[0]
     for _ in range(_REFITS):
         turns = _turns(left, begins, order)
-        whitened, logs = _whitened(table, turns, begins)
+        whitened, divided = _whitened(table, turns, begins)
         rest, volume = remainder(whitened)
         variance = float(rest @ rest) / n
         if variance <= 0.0:
             return -math.inf, left
-        logs += (n - freedom) * math.log(variance) + len(turns) * math.log(n) + volume
-        if logs > lowest - _ALIKE:
+        deviance = (n - freedom) * math.log(variance) + divided + volume
+        criterion = deviance + len(turns) * math.log(n)
+        if criterion > lowest - _ALIKE:
             break
-        lowest, left = logs, table[:, -1] - table[:, :-1] @ _amplitudes(whitened)
+        lowest, left = criterion, table[:, -1] - table[:, :-1] @ _amplitudes(whitened)
     return lowest + 2.0 * float(np.sum(np.log(sizes))), left
 
 
@@ -367,10 +369,10 @@ def _turns(signal: FloatArray, begins: IntArray, order: int) -> FloatArray:
 
 @njit(cache=True, nogil=True)
 def _whitened(signals: FloatArray, turns: FloatArray, begins: IntArray) -> tuple[FloatArray, float]:
-    """Signals (n, k) whitened from a first sample on, and the logarithm of what that divides by.
+    """Signals (n, k) whitened from a first sample on, and minus twice the logarithm of its volume.
 
-    By a lattice of these reflection coefficients; squares of the scales of the first samples, which
-    are foreseen from few, as the process has them.
+    By a lattice of these reflection coefficients; the first samples of a record, which are foreseen
+    from few, are divided by how much more they vary than the others.
     """
     n, count = signals.shape
     order, white, logs = len(turns), np.zeros((n, count)), 0.0

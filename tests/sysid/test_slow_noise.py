@@ -10,7 +10,7 @@ from sysid.gassi import GASSI
 from sysid.judging.examination import verdict_of
 from sysid.judging.whitener import Whitener
 from sysid.uncertainty.colour import Autoregression, colour, record_rows, score_covariance
-from sysid.uncertainty.slow_noise import SlowFilter, SlowNoise, slow_noise
+from sysid.uncertainty.slow_noise import SlowFilter, SlowNoise, _turns, _whitened, slow_noise
 from tests.soak import mostly_soak
 
 POLE, ZERO = 0.95, 0.7
@@ -69,6 +69,41 @@ def test_back_is_the_transpose_of_whitening():
         forward = white[places].T @ whitener.of_record(rows, columns)
         backward = whitener.back(rows, white).T @ columns.reshape(-1, 3)
         np.testing.assert_allclose(forward, backward, atol=1e-12)
+
+
+@pytest.mark.parametrize("turns", [[], [0.95], [-0.6, 0.9], [0.9, -0.3, 0.2]])
+def test_an_autoregression_by_reflection_coefficients_whitens_from_the_first_sample_on(turns):
+    """And its volume is that of the dense covariance, by Levinson's recursion."""
+    n, coefficients, variance = 40, np.zeros(0), 1.0
+    for turn in turns:
+        coefficients = np.append(coefficients - turn * coefficients[::-1], turn)
+        variance /= 1.0 - turn**2  # of the process, where its innovations' is one
+    response = lfilter([1.0], np.append(1.0, -coefficients), np.eye(1, 4000)[0])
+    correlations = np.array([response[: 4000 - k] @ response[k:] for k in range(n)])
+    assert correlations[0] == pytest.approx(variance)
+    whitened, divided = _whitened(np.eye(n), np.array(turns), np.array([0, n]))
+    dense = toeplitz(correlations)
+    np.testing.assert_allclose(whitened @ dense @ whitened.T, np.eye(n), atol=1e-9)
+    assert divided == pytest.approx(np.linalg.slogdet(dense)[1], abs=1e-9)
+    two = _whitened(np.vstack([np.eye(n)] * 2), np.array(turns), np.array([0, n, 2 * n]))
+    np.testing.assert_allclose(two[0], np.vstack([whitened] * 2), atol=1e-12)
+    simulated = lfilter(
+        [1.0], np.append(1.0, -coefficients), np.random.default_rng(0).normal(size=20000)
+    )
+    found = _turns(simulated, np.array([0, 20000]), 12)
+    np.testing.assert_allclose(found, turns, atol=0.03)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_that_is_slow_altogether_has_no_slow_part(seed):
+    """Of what a fit by squares leaves of it it seemed to: intervals had been 20 times too wide."""
+    rng, n = np.random.default_rng(seed), 300
+    levels = np.repeat(rng.choice([-1.0, 1.0], n // 30), 30)
+    slope = lfilter([0.05], [1.0, -0.95], levels)
+    noise = lfilter([0.05], [1.0, -0.95], rng.standard_normal(n))
+    left = noise - slope * (slope @ noise) / (slope @ slope)
+    seen = np.ones((n, 1), dtype=bool)
+    assert not colour(left[:, None], seen, [n], slope[:, None, None]).slow
 
 
 def test_what_an_autoregression_of_few_samples_tells_has_no_slow_part():
