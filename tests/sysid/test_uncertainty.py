@@ -413,6 +413,14 @@ def test_noise_of_an_input_that_the_residuals_show_is_not_counted_twice():
         assert other[name].std == pytest.approx(one[name].std, rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", [2, 5])
+def test_intervals_with_noise_on_an_input_are_as_wide_as_estimates_scatter(seed):
+    """With the lag's answer to it taken for noise with a slow part they had no lower end."""
+    record = noisy_record(np.random.default_rng([5, seed]), 0.3, 0.01)
+    found = estimates(NOISY.tell(records=[record]))["k"]
+    assert 3.0 < (found.high - found.low) / 0.12 < 6.0  # 0.12: deviation over 60 seeds
+
+
 @pytest.mark.soak
 def test_intervals_cover_with_noise_on_an_input():
     inside = []
