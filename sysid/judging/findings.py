@@ -110,7 +110,7 @@ _WORDS = {
     "errors have a memory: the fit has taken part of the answer for the plant's",
     "exchange": "{name} have changed places in the log",
 }
-_FAULTS = {"gain": "the gain", "offset": "an offset", "drift": "a drift"}
+_FAULTS = {"gain": "a wrong gain", "offset": "an offset", "drift": "a drift"}
 # What has no single amplitude.
 _SHAPES = {
     "rest": "another {name}, as behind a driver that opens between pulses: the model's equations "
@@ -126,8 +126,7 @@ def description(finding: Finding) -> str:
     text = _name_of(finding)
     if not finding.alike:
         return text
-    fault = f"{_FAULTS[finding.kind]} of {either(finding.alike)}"
-    return f"{text}, unless it is {fault}, which would look the same"
+    return f"{text}; {_FAULTS[finding.kind]} of {either(finding.alike)} would look the same"
 
 
 def _name_of(finding: Finding) -> str:

@@ -68,7 +68,7 @@ def test_a_gain_is_of_any_channel_where_data_do_not_tell_of_which(name, wrong):
     """With half the inertia and twice R and L a load of half its size is a current of twice its."""
     said = " ".join(tried(CASES[name], 0).verdict.parameters.reasons)
     first = re.search(r"(\w+) is [\d.]+ times what the model has", said)
-    same = re.search(r"unless it is the gain of ([\w, ]+), which would look the same", said)
+    same = re.search(r"; a wrong gain of ([\w, ]+) would look the same", said)
     assert first is not None and same is not None, said
     assert wrong in (first[1], *re.split(", | or ", same[1]))
 
