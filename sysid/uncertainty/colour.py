@@ -27,6 +27,7 @@ from sysid.uncertainty.slow_noise import (
 
 _LARGEST_ORDER = 12
 _BY_CHANCE = 4.0  # standard deviations of a correlation, to which it may come by chance
+_ROUNDING = 1e-12  # part of the largest eigenvalue
 SUCCESSIVE = 0.3  # correlation from which an innovation could be foreseen by the one before
 
 
@@ -160,21 +161,71 @@ def successive_correlation(
 
 
 def score_covariance(
-    slopes: FloatArray, seen: BoolArray, lengths: Sequence[int], model: Autoregression
+    slopes: FloatArray,
+    seen: BoolArray,
+    lengths: Sequence[int],
+    model: Autoregression,
+    residual: FloatArray | None = None,
 ) -> FloatArray:
     """Covariance (p, p) of sum_t slopes_t' e_t; slopes: (n, q, p), record after record.
 
-    seen: (n, q), which samples were measured.
+    seen: (n, q), which samples were measured. residual: (n, q), whose innovations may vary more
+    where slopes are large, as noise in proportion to a signal does; None of noise that is even.
     """
     p = slopes.shape[2]
     total, filters = np.zeros((p, p)), model.filters(seen, lengths)
+    parts = []
     for rows in record_rows(lengths):
         part = slopes[rows].copy()
         for j, kalman in filters.items():
             part[:, j] = kalman.response(part[:, j], rows)
         part = _response(part, model)
         total += np.einsum("tip,ij,tjr->pr", part, model.noise, part, optimize=True)
-    return total
+        parts.append(part)
+    if residual is None:
+        return total
+    white, known = _innovations(residual, seen, lengths, model)
+    return _uneven(total, np.concatenate(parts)[known], white[known], model.noise)
+
+
+def _innovations(
+    residual: FloatArray, seen: BoolArray, lengths: Sequence[int], model: Autoregression
+) -> tuple[FloatArray, BoolArray]:
+    """What is new in residuals, (n, q), and where it is known, (n,): after enough samples."""
+    fast, order = residual.copy(), len(model.coefficients)
+    for j, kalman in model.filters(seen, lengths).items():
+        fast[:, j] = kalman.innovations(fast[:, [j]])[:, 0]
+    white, known = fast.copy(), _usable(_whole(seen), lengths, order)
+    for k, matrix in enumerate(model.coefficients, start=1):
+        white[k:] -= fast[:-k] @ matrix.T
+    return white, known
+
+
+def _uneven(
+    even: FloatArray, responses: FloatArray, white: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """The covariance of a score, larger in directions in which its own terms scatter more.
+
+    By more than chance, else the larger of both would be too large. even: (p, p), of noise (q, q)
+    whatever the time. responses: (n, q, p), white: (n, q). See White, "A heteroskedasticity-
+    consistent covariance matrix estimator", Econometrica 48, 1980.
+    """
+    sizes = np.sqrt(np.diag(even))
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    values, vectors = np.linalg.eigh(even / np.outer(sizes, sizes))
+    felt = values > _ROUNDING * max(float(values[-1]), 1e-300)
+    roots = vectors[:, felt] * np.sqrt(values[felt]) * sizes[:, None]
+    back = vectors[:, felt] / np.sqrt(values[felt]) / sizes[:, None]
+    terms = np.einsum("tip,ti->tp", responses, white) @ back
+    by_noise = np.linalg.cholesky(noise + 1e-12 * np.trace(noise) * np.eye(len(noise)))
+    stated = np.einsum("tip,ij->tjp", responses, by_noise) @ back
+    axes = np.linalg.eigh(terms.T @ terms - np.einsum("tjp,tjr->pr", stated, stated))[1]
+    squares, expected = (terms @ axes) ** 2, np.sum((stated @ axes) ** 2, axis=1)
+    more = (squares - expected).sum(axis=0)
+    chance = _BY_CHANCE * np.sqrt(np.sum((squares - expected) ** 2, axis=0))
+    wider = (roots @ axes)[:, more > chance]
+    uneven: FloatArray = even + (wider * more[more > chance]) @ wider.T
+    return uneven
 
 
 def _response(slopes: FloatArray, model: Autoregression) -> FloatArray:

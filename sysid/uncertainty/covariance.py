@@ -174,8 +174,9 @@ def _score(
     residual, fitted = sensitivity.residual, sensitivity.slopes
     if held is not None:
         fitted = fitted[..., ~held]
-    noise = colour(residual, sensitivity.seen, sensitivity.lengths, fitted)
-    score = score_covariance(weighted, sensitivity.seen, sensitivity.lengths, noise)
+    seen, lengths = sensitivity.seen, sensitivity.lengths
+    noise = colour(residual, seen, lengths, fitted)
+    score = score_covariance(weighted, seen, lengths, noise, residual)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
     score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
     starts = (change for _, change in start_errors(sensitivity))

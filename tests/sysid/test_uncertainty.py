@@ -145,6 +145,32 @@ def test_residuals_that_grow_are_given_no_endless_memory():
     assert np.isfinite(score_covariance(np.ones((500, 1, 1)), seen(500), (500,), lone)).all()
 
 
+@pytest.mark.parametrize("coefficients", [np.zeros((0, 2, 2)), 0.6 * np.eye(2)[None]])
+def test_of_noise_that_is_larger_where_slopes_are_it_is_as_its_sums_scatter(coefficients):
+    """Where slopes are largest noise is, too: a textbook's intervals are 1.6 times too narrow."""
+    rng, n, repetitions = np.random.default_rng(0), 3000, 400
+    slopes = rng.standard_normal((n, 2, 3)) * [1.0, 1e-3, 1e3]
+    spread = 0.3 + np.abs(slopes[..., [0]])
+    lengths, taps = (1800, 1200), np.append(1.0, -coefficients[:, 0, 0])
+    sums = []
+    for _ in range(repetitions):
+        white = spread[..., 0] * rng.standard_normal((n, 2))
+        noise = np.vstack([lfilter([1.0], taps, part, axis=0) for part in np.split(white, [1800])])
+        sums.append(np.einsum("tip,ti->p", slopes, noise))
+    model = colour(noise, seen(n, 2), lengths)
+    found = score_covariance(slopes, seen(n, 2), lengths, model, noise)
+    plain = score_covariance(slopes, seen(n, 2), lengths, model)
+    ratios, even = (np.diag(c) / np.mean(np.square(sums), axis=0) for c in (found, plain))
+    assert ratios == pytest.approx(1.0, rel=0.3)
+    assert even[0] < 0.65
+    # Of even noise nothing is added.
+    even_noise = rng.standard_normal((n, 2))
+    model = colour(even_noise, seen(n, 2), lengths)
+    assert score_covariance(slopes, seen(n, 2), lengths, model, even_noise) == pytest.approx(
+        score_covariance(slopes, seen(n, 2), lengths, model)
+    )
+
+
 def test_of_white_residuals_it_is_sigma_squared_s_s():
     rng = np.random.default_rng(3)
     residual = 0.2 * rng.standard_normal((500, 1))
