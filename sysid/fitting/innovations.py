@@ -359,8 +359,9 @@ class Innovations(Objective):
         else:
             lengths = [record.n_samples for record in records]
             trust = _cut(self.trust, lengths)
-            counts = _counted(records, np.concatenate(trust))
-            vars(part).update(scatter=_cut(self.scatter, lengths), trust=trust, counts=counts)
+            vars(part).update(scatter=_cut(self.scatter, lengths), trust=trust)
+            if not self.quiet:
+                part.counts = _counted(records, np.concatenate(trust))
         return part
 
     def of_record(self, place: int, record: Dataset) -> Objective:
@@ -478,16 +479,17 @@ class Innovations(Objective):
         return not bool(np.abs(innovations / self._noise_of_each()).max() <= _UNLIKELY)
 
     def _without_lost(self, chromosome: FloatArray) -> Self:
-        """Without samples around which it has lost the states at a chromosome, (n_free,).
+        """Without samples at which it has lost the states at a chromosome, (n_free,).
 
         Noise of the inputs then moves innovations by more than they deviate, but in proportion.
+        Those that it moves by less count the less, so that none is in or out by a hair.
         """
         squares = self._squared_bends(chromosome)
-        lost = np.any(squares > 1.0, axis=1)
+        kept = np.maximum(1.0 - squares.max(axis=1), 0.0)
         seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
-        if np.any(seen[lost].sum(axis=0) > _MOSTLY * seen.sum(axis=0)):
+        if np.any(seen[kept == 0.0].sum(axis=0) > _MOSTLY * seen.sum(axis=0)):
             return self
-        return self._trusting(np.where(lost[:, None], 0.0, _trust(squares)))
+        return self._trusting(kept[:, None] * _trust(squares))
 
     def _squared_bends(self, chromosome: FloatArray) -> FloatArray:
         """Mean squares of ``_bends`` over the draws, (n_residuals, n_outputs)."""
@@ -496,9 +498,10 @@ class Innovations(Objective):
         return squares
 
     def _trusting(self, trust: FloatArray) -> Self:
-        """With the trust (n_residuals, n_outputs); samples of none do not count."""
+        """With the trust (n_residuals, n_outputs), of fewer samples where it leaves some out."""
         ends = np.cumsum([record.n_samples for record in self.records])[:-1]
-        return self._with(trust=np.split(trust, ends), counts=_counted(self.records, trust))
+        counts = self.counts if self.quiet else _counted(self.records, trust)
+        return self._with(trust=np.split(trust, ends), counts=counts)
 
     def bends(self, chromosome: FloatArray) -> FloatArray:
         """What draws of noise do to residuals but in proportion, at (n_free,).
@@ -612,9 +615,9 @@ def _cut(tables: Sequence[FloatArray], lengths: Sequence[int]) -> list[FloatArra
 
 
 def _counted(records: Sequence[Dataset], trust: FloatArray) -> IntArray:
-    """Samples that are seen and have a trust, (n_outputs,), of (n_residuals, n_outputs)."""
+    """As how many samples those that are seen count, (n_outputs,), by (n_residuals, n_outputs)."""
     seen = np.concatenate([np.isfinite(record.outputs) for record in records])
-    counted: IntArray = np.sum(seen & (trust > 0.0), axis=0)
+    counted: IntArray = np.rint(np.sum(np.where(seen, trust, 0.0) ** 2, axis=0)).astype(np.int64)
     return counted
 
 
