@@ -62,6 +62,10 @@ MISJUDGED = 0.02  # share of an output's innovations, above which a filter may b
 # Draws of the inputs' noise that show where equations bend under it, and parts of an innovation's
 # deviation from which they do.
 _DRAWS, _BENT = 8, 0.1
+# Deviations of an innovation that no chance explains: around a bend a filter may have lost the
+# states. Part of an output's noise down to which it holds where it has, and share of an output's
+# samples above which it is the parameters that are wrong.
+_UNLIKELY, _ANEW, _MOSTLY = 8.0, 0.5, 0.5
 # Integration steps of a free run that one of a filter may stand for, and by how many deviations of
 # any quantity the difference may move it where an answer is at stake.
 _FEWER, _FINER, _MOVING = (3.0, 2.0, 1.0), (0.5, 0.25), 0.2
@@ -299,10 +303,15 @@ class Innovations(Objective):
         # Noise of the inputs and of the process may explain nearly all of a free run's error.
         least = (_LEAST_OF_FILTER if self.corrects else _LEAST_NOISE) * self.error
         least = np.maximum(least, self.least_noise)
-        settled, last = self, None
+        settled, last, tested = self, None, np.full(len(self.noise), np.inf)
         for _ in range(_ROUNDS):
-            innovations = settled._simulated(chromosome[None], steps, balanced=False).values[..., 0]
-            before, noise = settled.noise, np.maximum(self.in_units(innovations), least)
+            innovations = settled._innovations(chromosome, steps)
+            # By less noise a filter may lose states that it keeps by more: what it then errs by
+            # would have the noise back.
+            if np.any(settled.noise < _ANEW * tested) and settled._may_be_lost(innovations):
+                settled, tested = settled._without_lost(chromosome), settled.noise
+                innovations = settled._innovations(chromosome, steps)
+            before, noise = settled.noise, np.maximum(settled.in_units(innovations), least)
             if not np.isfinite(noise).all():
                 return self
             change = np.log(noise / before)
@@ -326,7 +335,7 @@ class Innovations(Objective):
             return self
         as_shown = self.of_noise(wanted)
         steps = self.steps_needed(chromosome[None])
-        innovations = as_shown._simulated(chromosome[None], steps, balanced=False).values[..., 0]
+        innovations = as_shown._innovations(chromosome, steps)
         squares = (self.in_units(innovations) / wanted) ** 2
         by_chance = _BY_CHANCE * np.sqrt(2.0 / np.maximum(self.counts, 1))
         return self.of_noise(np.where(np.abs(squares - 1.0) < by_chance, wanted, self.noise))
@@ -334,6 +343,11 @@ class Innovations(Objective):
     def of_noise(self, noise: FloatArray) -> Self:
         """With other noise of the outputs, (n_outputs,)."""
         return self._with(noise=noise)
+
+    def no_more_than(self, rival: Self) -> Self:
+        """With no more noise and trust than another for the same records has."""
+        trust = np.minimum(np.concatenate(self.trust), np.concatenate(rival.trust))
+        return self._trusting(trust).of_noise(np.minimum(self.noise, rival.noise))
 
     def on(self, records: Sequence[Dataset], places: Sequence[int] | None = None) -> Objective:
         """The same, noise and averages included, on parts of its records."""
@@ -344,7 +358,10 @@ class Innovations(Objective):
             vars(part).update(colour=colours, scatter=scatters, trust=_full(records))
         else:
             lengths = [record.n_samples for record in records]
-            vars(part).update(scatter=_cut(self.scatter, lengths), trust=_cut(self.trust, lengths))
+            trust = _cut(self.trust, lengths)
+            vars(part).update(scatter=_cut(self.scatter, lengths), trust=trust)
+            if not self.quiet:
+                part.counts = _counted(records, np.concatenate(trust))
         return part
 
     def of_record(self, place: int, record: Dataset) -> Objective:
@@ -420,11 +437,18 @@ class Innovations(Objective):
 
     def share_bent(self, bends: FloatArray) -> FloatArray:
         """The same by ``bends``."""
-        parts = bends / (self._noise_of_each() * np.concatenate(self.trust))
+        trust = np.concatenate(self.trust)
+        bends = np.where(trust > 0.0, bends, np.nan)  # of what is left out it is known
+        parts = bends / (self._noise_of_each() * np.where(trust > 0.0, trust, 1.0))
         seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
         bent = seen & ~(np.median(np.abs(parts), axis=0) <= _BENT)
         share: FloatArray = bent.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
         return share
+
+    @property
+    def doubts(self) -> bool:
+        """Whether any innovation counts by less than it is."""
+        return any(bool(np.any(part < 1.0)) for part in self.trust)
 
     def renewed(self, chromosome: FloatArray) -> Self:
         """With the trust and the noise that a chromosome, (n_free,), asks for."""
@@ -434,14 +458,50 @@ class Innovations(Objective):
         """With innovations counted by the deviations that they have, bends at (n_free,) included.
 
         It takes in what was measured as before: what was foreseen is uncertain. Where inputs are
-        not averaged nothing bends noticeably, or nothing helps.
+        not averaged nothing bends noticeably, or nothing helps but to leave out where a filter has
+        lost the states.
         """
-        if not self.quiet:
+        if self.quiet:
+            return self._trusting(_trust(self._squared_bends(chromosome)))
+        trusting = self._trusting(np.ones_like(np.concatenate(self.trust)))
+        innovations = trusting._innovations(chromosome, self.steps_needed(chromosome[None]))
+        if not trusting._may_be_lost(innovations):
+            return trusting
+        return trusting._without_lost(chromosome)
+
+    def _may_be_lost(self, innovations: FloatArray) -> bool:
+        """Whether any of a filter's innovations (n_residuals, n_outputs) are by no chance.
+
+        Inputs not averaged, of which ``doubting`` tells anyway.
+        """
+        if self.quiet or not self.corrects:
+            return False
+        return not bool(np.abs(innovations / self._noise_of_each()).max() <= _UNLIKELY)
+
+    def _without_lost(self, chromosome: FloatArray) -> Self:
+        """Without samples at which it has lost the states at a chromosome, (n_free,).
+
+        Noise of the inputs then moves innovations by more than they deviate, but in proportion.
+        Those that it moves by less count the less, so that none is in or out by a hair.
+        """
+        squares = self._squared_bends(chromosome)
+        kept = np.maximum(1.0 - squares.max(axis=1), 0.0)
+        seen = np.concatenate([np.isfinite(record.outputs) for record in self.records])
+        if np.any(seen[kept == 0.0].sum(axis=0) > _MOSTLY * seen.sum(axis=0)):
             return self
+        return self._trusting(kept[:, None] * _trust(squares))
+
+    def _squared_bends(self, chromosome: FloatArray) -> FloatArray:
+        """Mean squares of ``_bends`` over the draws, (n_residuals, n_outputs)."""
         bends = self._with(exact=False)._bends(chromosome)
-        variances = np.mean(np.where(np.isfinite(bends), bends, 0.0) ** 2, axis=0)
+        squares: FloatArray = np.mean(np.where(np.isfinite(bends), bends, 0.0) ** 2, axis=0)
+        return squares
+
+    def _trusting(self, trust: FloatArray) -> Self:
+        """With the trust (n_residuals, n_outputs), of fewer samples where it leaves some out."""
         ends = np.cumsum([record.n_samples for record in self.records])[:-1]
-        return self._with(trust=np.split(1.0 / np.sqrt(1.0 + variances), ends))
+        counts = self.counts if self.quiet else _counted(self.records, trust)
+        return self._with(trust=np.split(trust, ends), counts=counts)
 
     def bends(self, chromosome: FloatArray) -> FloatArray:
         """What draws of noise do to residuals but in proportion, at (n_free,).
@@ -515,6 +575,11 @@ class Innovations(Objective):
         errors = self.error_of(self._roots(sse.sum(axis=1)))
         return errors, BatchResult(sse, status, steps.sum(axis=1))
 
+    def _innovations(self, chromosome: FloatArray, steps: IntArray) -> FloatArray:
+        """Innovations (n_residuals, n_outputs) at (n_free,), noise of the process not balanced."""
+        values: FloatArray = self._simulated(chromosome[None], steps, balanced=False).values[..., 0]
+        return values
+
     def _simulated(
         self, chromosomes: FloatArray, steps: IntArray, *, keep: bool = True, balanced: bool = True
     ) -> Residuals:
@@ -547,6 +612,19 @@ def filters(objective: Objective) -> TypeGuard[Innovations]:
 def _cut(tables: Sequence[FloatArray], lengths: Sequence[int]) -> list[FloatArray]:
     """The first tables, each from its begin as long as that."""
     return [table[:length] for table, length in zip(tables, lengths, strict=False)]
+
+
+def _counted(records: Sequence[Dataset], trust: FloatArray) -> IntArray:
+    """As how many samples those that are seen count, (n_outputs,), by (n_residuals, n_outputs)."""
+    seen = np.concatenate([np.isfinite(record.outputs) for record in records])
+    counted: IntArray = np.rint(np.sum(np.where(seen, trust, 0.0) ** 2, axis=0)).astype(np.int64)
+    return counted
+
+
+def _trust(squares: FloatArray) -> FloatArray:
+    """Parts of innovations that count, by the mean squares of what bends in their deviations."""
+    trust: FloatArray = 1.0 / np.sqrt(1.0 + squares)
+    return trust
 
 
 def _full(records: Sequence[Dataset]) -> list[FloatArray]:

@@ -163,7 +163,7 @@ def _resting(best: Optimum) -> Optimum:
     if not filters(fitted):
         return best
     finer = fitted.exactly(best.chromosome)
-    if finer.coarseness == fitted.coarseness and not fitted.quiet:
+    if finer.coarseness == fitted.coarseness and not fitted.doubts:
         return best
     settled = finer.renewed(best.chromosome)
     end = refine(settled, best.chromosome)

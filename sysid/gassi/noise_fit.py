@@ -86,14 +86,14 @@ class NoiseFit:
 
 
 def foresees_more(optimum: Optimum, rival: Optimum) -> bool:
-    """Whether its innovations are the less, by the lesser noise of both filters."""
+    """Whether its innovations are the less, by the lesser noise and trust of both filters."""
     fitted, before = optimum.objective, rival.objective
     assert isinstance(fitted, Innovations) and isinstance(before, Innovations)
     if optimum.feasible != rival.feasible:
         return optimum.feasible
-    common = fitted.of_noise(np.minimum(fitted.noise, before.noise)).uneased
+    common = fitted.no_more_than(before).uneased
     rms = common.rms(np.stack([optimum.chromosome, rival.chromosome]))
-    loss = np.log(np.maximum(rms, TINY)) @ (fitted.counts * (fitted.weights > 0.0))
+    loss = np.log(np.maximum(rms, TINY)) @ (common.counts * (common.weights > 0.0))
     return bool(loss[0] < loss[1])
 
 

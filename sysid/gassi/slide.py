@@ -76,13 +76,14 @@ def _corrected(space: SearchSpace, tied: Ties, at: FloatArray, moved: FloatArray
     for _ in range(_CORRECTIONS):
         chromosome = space.decode(onward)
         here = named_values(space, chromosome)
-        left = np.array([change(c, here, target) for c in tied.combinations])
-        slopes = np.stack([coded_gradient(c, space, chromosome) for c in tied.combinations])
+        with np.errstate(over="ignore", invalid="ignore"):  # far out where they do not converge
+            left = np.array([change(c, here, target) for c in tied.combinations])
+            slopes = np.stack([coded_gradient(c, space, chromosome) for c in tied.combinations])
+        if not (np.isfinite(left).all() and np.isfinite(slopes).all()):
+            return moved
         size = np.maximum(np.linalg.norm(slopes, axis=1), _TINY)
         onward = onward + np.linalg.pinv(slopes / size[:, None]) @ (left / size)
-        if not np.isfinite(onward).all():
-            return moved
-    return onward
+    return onward if np.isfinite(onward).all() else moved
 
 
 def _to_the_middle(space: SearchSpace, at: FloatArray, directions: FloatArray) -> FloatArray:

@@ -116,7 +116,7 @@ class DisturbedRun:
 
         Raises ModelError where a run in finer steps does not stay finite.
         """
-        if j in _averaged(self.record):
+        if j in self._averaged:
             return np.zeros(len(self.outputs))
         windows = np.zeros((*self.outputs.shape, 2))
         windows[:, j, 0] = -self.record.dt
@@ -177,6 +177,10 @@ class DisturbedRun:
         return self._change(self.response.of(start=np.eye(len(self.model.states))[place]))
 
     @cached_property
+    def _averaged(self) -> list[int]:
+        return _averaged(self.record)  # asked for with each change
+
+    @cached_property
     def _feedthrough(self) -> FloatArray:
         """Slopes of the outputs at their instants over the inputs, (n_samples, n_outputs, ...)."""
         return feedthrough(self.model, self.states, self.record.inputs, self.vector)
@@ -190,7 +194,7 @@ class DisturbedRun:
         """Outputs, of a run or what changes in them, averaged ones by their integrals behind."""
         count = len(self.model.outputs)
         outputs, integrals = response[:, :count].copy(), response[:, count:] / self.record.dt
-        for j, integral in zip(_averaged(self.record), integrals.T, strict=True):
+        for j, integral in zip(self._averaged, integrals.T, strict=True):
             within = windows[:, j] / self.record.dt
             outputs[:, j] = average(outputs[:, [j]], integral[:, None], within)[:, 0]
         return outputs

@@ -24,12 +24,13 @@ from sysid import (
 )
 from sysid.engine.filter_settings import FilterSettings
 from sysid.fitting.averages import denoised, just_missed
+from sysid.fitting.free_run import free_run
 from sysid.fitting.innovations import Innovations
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.gassi.excerpt import Excerpt
 from sysid.gassi.filter_search import better_by_filter
-from sysid.gassi.noise_fit import NoiseFit, towards
+from sysid.gassi.noise_fit import NoiseFit, foresees_more, towards
 from sysid.gassi.optima import Optimum
 from sysid.judging.examination import suspected, verdict_of
 from sysid.uncertainty import uncertainty
@@ -568,6 +569,53 @@ def test_innovations_count_by_what_noise_does_to_them_at_a_bend():
     # What was measured is taken in as before.
     kept, counted = (f.residuals(truth[None], [4]).values[..., 0] for f in (averaged, doubting))
     assert counted == pytest.approx(kept * doubting.trust[0], rel=1e-9, abs=1e-12)
+
+
+WELLS = ProcessModel(
+    name="wells",
+    states=(State("x", "1", initial=-1.0),),
+    inputs=(Input("u", "1"),),
+    outputs=(Output("y", "1"),),
+    parameters=(
+        Parameter("tau", "s", 1.0, 0.1, 10.0, "log"),
+        Parameter("gain", "1", 1.0, 0.1, 10.0, "log"),
+    ),
+    derivative=lambda x, u, p: ((x[0] - x[0] ** 3 + p[1] * u[0]) / p[0],),
+    output=lambda x, u, p: (x[0] * x[0],),
+)
+
+
+def records_of_wells():
+    """Six records of a bead that a force barely takes over a saddle; y is blind to the side."""
+    for seed in range(18, 24):
+        rng = np.random.default_rng(seed)
+        u = 0.55 * np.sin(2.0 * np.pi * 0.05 / 15.0 * np.arange(1200))
+        clean = Dataset(u, np.zeros(1200), 0.05)
+        y = free_run(BatchSimulator(WELLS, accuracy=1e-6), WELLS.nominal, clean)
+        noisy = u + 0.05 * rng.standard_normal(1200)
+        y = y + 0.02 * rng.standard_normal(y.shape)
+        yield Dataset(noisy, y, 0.05, input_noise=np.array([0.05]))
+
+
+def test_where_a_filter_has_lost_the_states_its_errors_are_no_noise():
+    """In one record it stays on the wrong side for a third of the time, from the truth on."""
+    records = [*records_of_wells()]
+    objective = Objective(BatchSimulator(WELLS), SearchSpace.of(WELLS), records)
+    lost = Innovations.of(objective, np.array([0.02]), corrects=True)
+    innovations = lost.residuals(WELLS.nominal[None], [8] * 6).values[..., 0, 0]
+    squares = np.sum(innovations.reshape(6, -1) ** 2, axis=1)
+    assert squares[3] > 10.0 * np.median(squares)
+    fit = NoiseFit(objective, objective, corrects=True)(WELLS.nominal)
+    fitted = fit.objective
+    assert fitted.noise == pytest.approx([0.02], rel=0.05)
+    assert fit.chromosome == pytest.approx(WELLS.nominal, rel=0.01)
+    left_out = [np.mean(trust == 0.0) for trust in fitted.trust]
+    assert 0.2 < left_out.pop(3) < 0.45 and max(left_out) == 0.0
+    assert fitted.counts == pytest.approx([sum(np.sum(trust**2) for trust in fitted.trust)], abs=1)
+    assert fitted.bent(fit.chromosome) > 0.03
+    # Rivals are compared by what neither has lost.
+    poor = Optimum.of(lost, np.array([0.8, 1.0]), fit.rms)
+    assert foresees_more(fit, poor) and not foresees_more(poor, fit)
 
 
 def test_intervals_are_those_of_the_averaged_inputs_that_were_fitted():

@@ -22,6 +22,8 @@ from sysid.gassi.slide import centred, slid
 from sysid.problem.space import SearchSpace
 from sysid.response.linearization import jacobian
 from sysid.uncertainty import uncertainty
+from sysid.uncertainty.sensitivity import sensitivity
+from sysid.uncertainty.ties import ties
 from tests.sysid.support import Formula, prbs
 
 
@@ -496,14 +498,16 @@ def test_a_minimum_is_moved_to_the_middle_of_its_tie_and_stays_one():
     assert centred(alone, np.array([0.03, 0.12])) is None
 
 
+SUM_LAG = replace(
+    PRODUCT_LAG,
+    name="sum lag",
+    derivative=lambda x, u, p: (u[0] - (p[0] + p[1]) * x[0] * p[2],),
+)
+
+
 def test_along_a_tie_that_bends_its_sum_is_kept_and_no_descent_is_needed():
     """a + b on logarithmic scales: far along it a straight way is no tie any more."""
-    model = replace(
-        PRODUCT_LAG,
-        name="sum lag",
-        derivative=lambda x, u, p: (u[0] - (p[0] + p[1]) * x[0] * p[2],),
-    )
-    target = objective_of(model, record_of(model, 0.01, noise=0.02))
+    target = objective_of(SUM_LAG, record_of(SUM_LAG, 0.01, noise=0.02))
     end = refine(target, np.array([9.9, 0.4, 0.05])).chromosome
     before = target.simulations
     moved = centred(target, end)
@@ -511,6 +515,30 @@ def test_along_a_tie_that_bends_its_sum_is_kept_and_no_descent_is_needed():
     assert abs(np.log(moved[0] / end[0])) > 0.3
     assert (moved[0] + moved[1]) * moved[2] == pytest.approx((end[0] + end[1]) * end[2], rel=1e-9)
     assert target.evaluate(moved[None])[0] == pytest.approx(target.evaluate(end[None])[0], rel=1e-6)
+
+
+def test_a_way_from_which_nothing_leads_back_onto_a_tie_is_left(monkeypatch):
+    """Of a z(0) below zero steps from where a is next to nothing pass what numbers can be."""
+    model = ProcessModel(
+        name="decay",
+        states=(State("z", "1", initial_range=(-1.0, 1.0)),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("y", "1"),),
+        parameters=(
+            Parameter("a", "1", 1.0, 1e-12, 10.0, "log"),
+            Parameter("tau", "s", 1.0, 0.1, 10.0, "log"),
+        ),
+        derivative=lambda x, u, p: (-x[0] / p[1],),
+        output=lambda x, u, p: (p[0] * x[0],),
+    )
+    record = Dataset(np.zeros(40), -10.0 * np.exp(-0.05 * np.arange(40)), 0.05)
+    space = SearchSpace.of(model).with_starts([record])
+    target = Objective(BatchSimulator(model), space, [record])
+    end = np.array([10.0, 1.0, -1.0])
+    alone = replace(ties(sensitivity(target, end)), directions=np.array([[1.0, 0.0, 0.0]]))
+    monkeypatch.setattr("sysid.gassi.slide.ties", lambda local: alone)
+    moved = centred(target, end)
+    assert moved is None or target.evaluate(moved[None])[0] < 1e-4
 
 
 def test_a_tied_value_stays_on_an_end_that_the_data_want_it_beyond():
