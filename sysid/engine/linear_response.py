@@ -57,6 +57,7 @@ class LinearResponse:
         vector: FloatArray | None = None,
         held: FloatArray | None = None,
         before: FloatArray | None = None,
+        jumps: tuple[FloatArray, FloatArray] | None = None,
     ) -> FloatArray:
         """Changes of the outputs, or of what is kept of the innovations, (n_samples, n_outputs).
 
@@ -65,7 +66,8 @@ class LinearResponse:
         the states begin elsewhere; vector: (n_parameters,), by what is added to the equations'
         parameters; held: (n_samples, n_inputs), by what is added to inputs from each sample to the
         next; before: of the rates' shape, what they are just before each sample, where they jump as
-        inputs do that are held. Behind the model's states and outputs stand integrals of those that
+        inputs do that are held; jumps: (n_samples, n_states) each, of the states just before and
+        just after each sample. Behind the model's states and outputs stand integrals of those that
         are averaged, which may be left out.
         """
         n, _, m = self.rows.shape
@@ -79,6 +81,11 @@ class LinearResponse:
             _push(pushes, self.slopes.by_parameters, np.tile(vector, (n - 1, 1)))
         if start is not None:
             first[: len(start)] = start
+        if jumps is not None:
+            ahead, after = jumps
+            count = after.shape[1]
+            pushes[:-1, :count] += ahead[1:]
+            pushes += np.einsum("kba,kb->ka", self.onward[:, :count], after)
         added = np.zeros(self.kept.shape)
         if outputs is not None:
             added[:, : outputs.shape[1]] = outputs

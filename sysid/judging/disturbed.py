@@ -5,6 +5,7 @@ equations to the signal phi(x(t), u(t)) along the undisturbed run, but for terms
 Jacobians of one run tell what any function in any equation would do.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -146,6 +147,38 @@ class DisturbedRun:
         """Change of the outputs per unit of a change of the inputs, (n_samples, n_inputs)."""
         outputs = np.einsum("kji,ki->kj", self._feedthrough, inputs)
         return self._change(self.response.of(inputs=inputs, outputs=outputs))
+
+    def acted_before(self, i: int, signal: FloatArray, time: float) -> FloatArray:
+        """Change of the outputs where of a held input i a signal has acted so much [s] before.
+
+        Of the two values that it then has within a sample one acts throughout, and what the other
+        adds at the begin or the end is in part even and in part a jump of the states, of the same
+        mean and centre: fast states forget what was at the begin.
+        """
+        samples = time / self.record.dt
+        whole = math.floor(samples)
+        part, places, last = samples - whole, np.arange(len(signal)) + whole, len(signal) - 1
+        at_begin, at_end = (
+            self._put(i, signal[np.clip(at, 0, last)] - signal) for at in (places, places + 1)
+        )
+        added = self._rates_by(at_end) - self._rates_by(at_begin)
+        even = part**2 if part < 0.5 else 2.0 * part - part**2
+        jump = (part - even) * self.record.dt * added
+        none = np.zeros_like(jump)
+        jumps = (delayed(jump), none) if part < 0.5 else (none, jump)
+        jumped = self._change(self.response.of(jumps=jumps))
+        return self.driven((1.0 - even) * at_begin + even * at_end) + jumped
+
+    def _put(self, i: int, signal: FloatArray) -> FloatArray:
+        """A signal (n_samples,) in the place of input i, nothing in the others."""
+        inputs = np.zeros_like(self.record.inputs)
+        inputs[:, i] = signal
+        return inputs
+
+    def _rates_by(self, inputs: FloatArray) -> FloatArray:
+        """Rates just after each sample, (n_samples, n_states), by what is added to the inputs."""
+        moved = self.record.inputs + inputs
+        return rates_along(self.model.derivative, self.states, moved, self.vector)
 
     def likely_noise(self, i: int) -> FloatArray:
         """What of input i is likely to be noise, (n_samples,): nothing that follows the motion.

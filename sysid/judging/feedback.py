@@ -15,6 +15,7 @@ from sysid.arrays import FloatArray
 from sysid.judging.whitener import Whitener
 from sysid.uncertainty.colour import colour, record_rows
 
+_AT_REST = 0.5  # share of samples in which an input stands still that answers nothing
 _SOON = 3  # samples within which a controller answers, the one of the error itself the first
 
 
@@ -29,16 +30,21 @@ def answer_probability(white: FloatArray, signal: FloatArray, lengths: Sequence[
     True
     """
     new = news(signal, lengths)
-    if not new.any():
+    if not new.any() or np.mean(np.diff(signal) == 0.0) > _AT_REST:
         return 1.0
-    products = np.zeros((_SOON, white.shape[1]))
-    for rows in record_rows(lengths):
-        for lag in range(min(_SOON, rows.stop - rows.start)):
-            products[lag] += new[rows][lag:] @ white[rows][: rows.stop - rows.start - lag]
-    sizes = np.sum(white**2, axis=0) * np.sum(new**2)
-    squares = np.divide(products**2, sizes, out=np.zeros_like(products), where=sizes > 0.0)
-    count = int(np.count_nonzero(new))
-    chances = chdtrc(_SOON, count * squares.sum(axis=0))
+    # An output that an input reaches at once, as its sensor or a late sample does, errs with what
+    # is new of it where that is large; what a controller answers is in all that is new.
+    small = np.where(np.abs(new) <= np.median(np.abs(new)), new, 0.0)
+    statistic = np.zeros(white.shape[1])
+    for lag in range(_SOON):
+        answer = new if lag else small
+        products, squares = np.zeros(white.shape[1]), np.zeros(white.shape[1])
+        for rows in record_rows(lengths):
+            late, errors = answer[rows][lag:], white[rows][: rows.stop - rows.start - lag]
+            products += late @ errors
+            squares += late**2 @ errors**2
+        statistic += np.divide(products**2, squares, out=np.zeros_like(squares), where=squares > 0)
+    chances = chdtrc(_SOON, statistic)
     return min(float(chances.min()) * len(chances), 1.0)
 
 

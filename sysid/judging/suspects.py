@@ -56,7 +56,7 @@ _LEVELS = 3  # of a signal, below which it shows no function
 # measured, and of a state, which the run follows between samples too, one of six samples a period.
 _JUMPING, _JUMPING_STATE = 0.05, 1.0
 # Delays that are tested [samples]: of a large one a small one tells little where inputs jump.
-_DELAYS = (0.1, -12.0, -4.0, 4.0, 12.0)
+_DELAYS = (0.1, -0.1, -12.0, -4.0, 4.0, 12.0)
 _FILTERS = (1.0, 5.0)  # time constants of filters that are tested [samples]
 _PLAYS = (0.02, 0.1)  # parts of an input's peak
 # Deviations of chance by which two levels differ; samples that a signal stands at a level at least,
@@ -151,8 +151,11 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     for i, given in enumerate(model.inputs):
         if not any(np.any(run.record.inputs[:, i]) for run in runs):
             continue
-        for kind, change in _LATE_INPUTS.items():
-            for late in _late(kind, given.name, partial(_input_changed, runs, i, change), runs):
+        ways = {kind: partial(_input_changed, runs, i, way) for kind, way in _LATE_INPUTS.items()}
+        if given.hold == "zoh":
+            ways["delay"] = partial(_acted_before, runs, i)
+        for kind, change in ways.items():
+            for late in _late(kind, given.name, change, runs):
                 yield replace(late, of_input=True)
         yield from _plays(given, partial(_input_changed, runs, i, _with_play), runs, i)
         yield from _noises(given, runs, i)
@@ -265,10 +268,13 @@ def _with_play(run: DisturbedRun, i: int, width: float) -> FloatArray:
     return change
 
 
-def _acted_before(run: DisturbedRun, i: int, time: float) -> FloatArray:
-    """What is logged late has acted before."""
-    held = run.model.inputs[i].hold == "zoh"
-    return shifted(_acting(run, i), time / run.record.dt, held)
+def _acted_before(runs: Sequence[DisturbedRun], i: int, time: float) -> FloatArray:
+    """A held input that is logged late has acted before, within a sample as well."""
+    return of_each(runs, lambda run: run.acted_before(i, _acting(run, i), time))[..., None]
+
+
+def _moved_forward(run: DisturbedRun, i: int, time: float) -> FloatArray:
+    return shifted(_acting(run, i), time / run.record.dt, held=False)
 
 
 def _unfiltered(run: DisturbedRun, i: int, time: float) -> FloatArray:
@@ -293,7 +299,7 @@ def _acting(run: DisturbedRun, i: int) -> FloatArray:
 
 
 _LATE_INPUTS: dict[Kind, _Change] = {
-    "delay": _acted_before,
+    "delay": _moved_forward,
     "filter": _unfiltered,
     "lag": _lagging,
 }

@@ -16,8 +16,8 @@ from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.suspects import SPEEDS, Suspect, added_rates, physical_equations
 
 # Dry friction in parts of the largest that acts on a speed, and offsets in parts of a channel's
-# largest value: as is usual.
-_FRICTION, _OFFSET = 0.05, 0.01
+# largest value, delays in parts of a sample: as is usual.
+_FRICTION, _OFFSET, _DELAY = 0.05, 0.01, 0.1
 _RATHER = 0.1  # part by which a term may differ from friction and still be some
 _PROBE = 1e-3
 _ROUNDED = 0.01  # of a speed's largest, below which the sign of a wrong run is not known
@@ -43,7 +43,7 @@ class Possibility:
 def possibilities(
     runs: Sequence[DisturbedRun], channels: Sequence[Suspect]
 ) -> Iterator[Possibility]:
-    """Offsets among the channels' suspects, and dry friction of speeds of which there is none."""
+    """Offsets and delays of the channels' suspects, and dry friction of speeds without any."""
     model = runs[0].model
     inputs, outputs = (
         np.abs(np.concatenate(values)).max(axis=0).tolist()
@@ -57,9 +57,22 @@ def possibilities(
             cure = f"Take the zero of {suspect.name} at rest, in a calibration."
             usual = _OFFSET * largest[suspect.name]
             yield Possibility(suspect, usual, words, 1.0, suspect.unit, cure)
+    yield from _delays(runs[0], channels)
     for i in physical_equations(runs[0]):
         if model.states[i].unit in SPEEDS and not _rubs(runs, i):
             yield _friction(runs, i)
+
+
+def _delays(run: DisturbedRun, channels: Sequence[Suspect]) -> Iterator[Possibility]:
+    """Inputs that act later than they are logged, within a sample, for drivers take their time."""
+    usual = _DELAY * run.record.dt
+    for name in run.model.input_names:
+        late = next((s.late for s in channels if s.kind == "delay" and s.name == name), None)
+        if late is not None:
+            suspect = Suspect("delay", name, "s", late(-usual) / usual, of_input=True)
+            words = f"that {name} acts up to {{size}} later than it is logged"
+            cure = f"Logs sampled faster tell, or a scope that shows {name}."
+            yield Possibility(suspect, usual, words, 1.0, "s", cure)
 
 
 def _friction(runs: Sequence[DisturbedRun], i: int) -> Possibility:

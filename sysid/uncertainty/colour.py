@@ -184,8 +184,8 @@ def score_covariance(
         parts.append(part)
     if residual is None:
         return total
-    white, known = _innovations(residual, seen, lengths, model)
-    return _uneven(total, np.concatenate(parts)[known], white[known], model.noise)
+    white, usable = _innovations(residual, seen, lengths, model)
+    return _uneven(total, np.concatenate(parts)[usable], white[usable], model.noise)
 
 
 def _innovations(
@@ -195,10 +195,10 @@ def _innovations(
     fast, order = residual.copy(), len(model.coefficients)
     for j, kalman in model.filters(seen, lengths).items():
         fast[:, j] = kalman.innovations(fast[:, [j]])[:, 0]
-    white, known = fast.copy(), _usable(_whole(seen), lengths, order)
+    white, usable = fast.copy(), _usable(_whole(seen), lengths, order)
     for k, matrix in enumerate(model.coefficients, start=1):
         white[k:] -= fast[:-k] @ matrix.T
-    return white, known
+    return white, usable
 
 
 def _uneven(

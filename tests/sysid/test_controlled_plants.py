@@ -79,3 +79,35 @@ def test_what_acts_with_a_held_input_does_not_act_before_it():
     assert not change[:21].any()
     expected = (1.0 - np.exp(-RATE * DT * np.arange(30))) / RATE
     np.testing.assert_allclose(change[20:], expected, rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("samples", "tolerance"), [(-0.02, 0.05), (-1.0, 1e-3), (-1.1, 0.05), (0.05, 0.1), (2.0, 1e-3)]
+)
+def test_what_a_held_input_has_done_before_or_after_is_what_fast_states_keep_of_it(
+    samples, tolerance
+):
+    """A plant that forgets seven eighths of what was at the begin of a sample by its end."""
+    rng, n, rate = np.random.default_rng(0), 60, 210.0
+    u = np.repeat(rng.uniform(-1.0, 1.0, n // 6), 6)
+    u[:6] = u[-6:] = 0.0
+    pole = np.exp(-rate * DT)
+
+    def response(shift):
+        """By halves of each sample, the first of what is held at its begin."""
+        whole, part = int(np.floor(shift)), shift - np.floor(shift)
+        x, y = 0.0, np.zeros(n)
+        for k in range(n):
+            y[k] = x
+            for value, width in ((k + whole, 1.0 - part), (k + whole + 1, part)):
+                onward = np.exp(-rate * DT * width)
+                x = onward * x + (1.0 - onward) * u[np.clip(value, 0, n - 1)]
+        return y
+
+    record = Dataset(u, response(0.0), DT)
+    run = DisturbedRun.free(LAG, np.array([rate, rate]), record, np.zeros(1), 4, Workers(1))
+    assert run.outputs[:, 0] == pytest.approx(response(0.0), abs=1e-9)
+    moved = response(samples) - response(0.0)
+    assert 0.0 < pole < 0.13
+    error = run.acted_before(0, u, samples * DT)[:, 0] - moved
+    assert np.linalg.norm(error) < tolerance * np.linalg.norm(moved)

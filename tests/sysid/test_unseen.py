@@ -74,3 +74,42 @@ def test_friction_that_the_model_has_is_not_missing():
     """What it may be by data of one way its own interval says."""
     notes = " ".join(blind_spots(verdict_on(RUBBING, 0, DRY)))
     assert "dry friction" not in notes
+
+
+WINDING = ProcessModel(
+    name="winding",
+    states=(State("i", "A"),),
+    inputs=(Input("V", "V"),),
+    outputs=(Output("i", "A"),),
+    parameters=(
+        Parameter("R", "ohm", 1.5, 0.2, 20.0, "log"),
+        Parameter("L", "H", 2e-3, 1e-4, 1e-2, "log"),
+    ),
+    derivative=lambda x, u, p: ((u[0] - p[0] * x[0]) / p[1],),
+)
+
+
+def switched(seed, place, late, n=2000, dt=1e-3):
+    """Current of a winding of 2.3 ohm and 1.1 mH whose voltage acts so many samples late."""
+    rng = np.random.default_rng([seed, place])
+    lengths = rng.integers(10, 60, n // 10)
+    levels = np.repeat(rng.uniform(-12.0, 12.0, len(lengths)), lengths)[:n]
+    x, before, i = 0.0, 0.0, np.empty(n)
+    for k in range(n):
+        i[k] = x
+        for volt, part in ((before, late), (levels[k], 1.0 - late)):
+            pole = np.exp(-2.3 / 1.1e-3 * part * dt)
+            x = pole * x + (1.0 - pole) * volt / 2.3
+        before = levels[k]
+    return Dataset(levels, i + 0.02 * rng.standard_normal(n), dt, f"place {place}")
+
+
+@pytest.mark.parametrize("late", [0.0, 0.03])
+def test_a_driver_that_takes_its_time_looks_like_another_inductance(late):
+    """30 us late at 1 kHz, and L is 3 % off: three half widths."""
+    records = [switched(0, place, late) for place in (1, 2)]
+    fitted = GASSI(WINDING, population=60, generations=14, random_state=0).fit(records[0])
+    verdict = verdict_of(fitted, records[:1], records[1:])
+    (note,) = blind_spots(verdict)
+    assert note.startswith("These data would not show that V acts up to ")
+    assert " s later than it is logged. That would move L by " in note.replace("µs", "s")
