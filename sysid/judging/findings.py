@@ -44,7 +44,7 @@ class Finding:
     an input. p_value: by chance, all tests counted. share: of the whitened residuals' squares that
     it explains. moves: the farthest first. wider: how many times as wide the interval is that it
     widens most. cure: of what would not be seen, what would show it. alike: channels, of which the
-    same fault would look the same in these data.
+    same fault would look the same in these data; instead: other faults that explain nearly as much.
     """
 
     kind: Kind
@@ -60,6 +60,7 @@ class Finding:
     rivals: tuple[AddedTerm, ...] = ()
     cure: str = ""
     alike: tuple[str, ...] = ()
+    instead: tuple["Finding", ...] = ()
 
     @property
     def farthest(self) -> float:
@@ -103,6 +104,7 @@ _WORDS = {
     "offset": "{name} is {amplitude:.3g} {unit} off{instead}",
     "drift": "{name} drifts by {amplitude:.3g} {unit} from a record's first sample on{instead}",
     "noise": "{name} is logged with noise of {amplitude:.2g} {unit}, which has not acted",
+    "crosstalk": "{name} as well, {amplitude:.2g} {unit} of it (crosstalk)",
     "saturation": "{name} saturates near its largest values",
     "fixed": "{name}, which is fixed, would be {times:.3g} times its value, or the gain of a "
     "channel is wrong that looks the same",
@@ -123,7 +125,7 @@ _SHAPES = {
 
 def description(finding: Finding) -> str:
     """A finding in a few words, with what looks the same."""
-    text = _name_of(finding)
+    text = ", or ".join(map(_name_of, (finding, *finding.instead)))
     if not finding.alike:
         return text
     return f"{text}; {_FAULTS[finding.kind]} of {either(finding.alike)} would look the same"

@@ -74,7 +74,8 @@ _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
 _HALF = 0.5  # of the residuals' squares, which other equations at rest leave at most, to be named
-_SAME = 0.1  # of what one explains, up to which what another does differs from it and is the same
+# Of what one explains, up to which what another does differs from it and is the same, or nearly.
+_SAME, _NEARLY_SAME = 0.1, 0.7
 _AS_LATE = 0.8  # of what one explains that is early, that counts for as much where it is late
 _LIKELY = 8  # suspects that are tested side by side, and again by the colour of what they leave
 _FEW = 25  # samples for each amplitude, below which what they leave tells no colour
@@ -389,15 +390,26 @@ class _Tests:
                 for i in significant
                 if i != surest and suspects[i].shares_place(suspect)
             ]
-            moves = [self._moved(changes[surest], result), *alone, *shapes]
+            # A sensor that sees another channel looks much like one that is late, and moves more.
+            nearly = [
+                (i, self._moved(changes[i], results[i][0]))
+                for i in significant
+                if (suspects[i].kind == "crosstalk") != (suspect.kind == "crosstalk")
+                if {suspects[i].kind, suspect.kind} <= {"crosstalk", "delay"}
+                if self._leave_the_same(results[i][1], residual, _NEARLY_SAME)
+            ]
+            instead = [
+                self._finding(suspects[i], results[i][0], [m], logs[i], ()) for i, m in nearly
+            ]
+            moves = [self._moved(changes[surest], result), *alone, *shapes, *(m for _, m in nearly)]
             same = [
                 suspects[i].name
                 for i in significant
                 if suspect.kind in _SCALES and suspects[i].kind == suspect.kind
-                if i != surest and self._leave_the_same(results[i][1], residual)
+                if i != surest and self._leave_the_same(results[i][1], residual, _SAME)
             ]
             finding = self._finding(suspect, result, moves, logs[surest], terms)
-            self.findings.append(replace(finding, alike=tuple(same)))
+            self.findings.append(replace(finding, alike=tuple(same), instead=tuple(instead)))
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -406,10 +418,14 @@ class _Tests:
             self._recolour(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
 
-    def _leave_the_same(self, residual: FloatArray, another: FloatArray) -> bool:
-        """Whether two suspects, by what each leaves, (n, n_outputs), explain the same."""
+    def _leave_the_same(self, residual: FloatArray, another: FloatArray, tolerance: float) -> bool:
+        """Whether two suspects, by what each leaves, (n, n_outputs), explain nearly the same.
+
+        tolerance: of what the second explains, up to which they differ.
+        """
         before = self._residual - self._columns @ self._regression.coefficients
-        return self._squares(residual - another) < _SAME**2 * self._squares(before - another)
+        difference, explained = residual - another, before - another
+        return self._squares(difference) < tolerance**2 * self._squares(explained)
 
     def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
         """Whether it is a fault by its size.

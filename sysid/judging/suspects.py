@@ -34,6 +34,7 @@ Kind = Literal[
     "drift",
     "gain",
     "saturation",
+    "crosstalk",
     "noise",
     "change",
     "bend",
@@ -148,6 +149,7 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         for kind, signal in _faults(partial(_output, j), zeroed):
             changes = _logged(runs, j, signal)[..., None]
             yield Suspect(kind, output.name, _unit(kind, output.unit), changes)
+    yield from _crosstalk(runs)
     for i, given in enumerate(model.inputs):
         if not any(np.any(run.record.inputs[:, i]) for run in runs):
             continue
@@ -166,6 +168,18 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             changes = sign * _driven(runs, i, signal)
             unit = _unit(kind, given.unit)
             yield Suspect(kind, given.name, unit, changes[..., None], of_input=True)
+
+
+def _crosstalk(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
+    """Outputs whose sensors see an input without noise, or another output, as well."""
+    model, exact = runs[0].model, runs[0].record.input_noise == 0.0
+    seen = [(s.name, s.unit, partial(_input, i)) for i, s in enumerate(model.inputs) if exact[i]]
+    seen += [(s.name, s.unit, partial(_output, j)) for j, s in enumerate(model.outputs)]
+    for j, output in enumerate(model.outputs):
+        for name, unit, signal in (each for each in seen if each[0] != output.name):
+            changes = _logged(runs, j, signal)[..., None]
+            place, by = f"{name} stands in {output.name}", f"{output.unit}/{unit}"
+            yield Suspect("crosstalk", place, by, changes)
 
 
 def _late(

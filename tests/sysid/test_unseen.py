@@ -1,5 +1,7 @@
 """What no residual shows and moves parameters all the same is said, and only where it does."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -89,8 +91,11 @@ WINDING = ProcessModel(
 )
 
 
-def switched(seed, place, late, n=2000, dt=1e-3):
-    """Current of a winding of 2.3 ohm and 1.1 mH whose voltage acts so many samples late."""
+def switched(seed, place, late, crosstalk=0.0, n=2000, dt=1e-3):
+    """Current of a winding of 2.3 ohm and 1.1 mH whose voltage acts so many samples late.
+
+    crosstalk: of the voltage in what is logged of the current [A/V].
+    """
     rng = np.random.default_rng([seed, place])
     lengths = rng.integers(10, 60, n // 10)
     levels = np.repeat(rng.uniform(-12.0, 12.0, len(lengths)), lengths)[:n]
@@ -101,15 +106,29 @@ def switched(seed, place, late, n=2000, dt=1e-3):
             pole = np.exp(-2.3 / 1.1e-3 * part * dt)
             x = pole * x + (1.0 - pole) * volt / 2.3
         before = levels[k]
-    return Dataset(levels, i + 0.02 * rng.standard_normal(n), dt, f"place {place}")
+    i += crosstalk * levels + 0.02 * rng.standard_normal(n)
+    return Dataset(levels, i, dt, f"place {place}")
+
+
+def verdict_on_winding(*wrong):
+    records = [switched(0, place, *wrong) for place in (1, 2)]
+    fitted = GASSI(WINDING, population=60, generations=14, random_state=0).fit(records[0])
+    return verdict_of(fitted, records[:1], records[1:])
 
 
 @pytest.mark.parametrize("late", [0.0, 0.03])
 def test_a_driver_that_takes_its_time_looks_like_another_inductance(late):
     """30 us late at 1 kHz, and L is 3 % off: three half widths."""
-    records = [switched(0, place, late) for place in (1, 2)]
-    fitted = GASSI(WINDING, population=60, generations=14, random_state=0).fit(records[0])
-    verdict = verdict_of(fitted, records[:1], records[1:])
-    (note,) = blind_spots(verdict)
+    (note,) = blind_spots(verdict_on_winding(late))
     assert note.startswith("These data would not show that V acts up to ")
     assert " s later than it is logged. That would move L by " in note.replace("µs", "s")
+
+
+def test_a_sensor_that_sees_the_voltage_is_named_with_how_much_of_it():
+    """1 % of a voltage of 12 V, and R is 2 % off; a delay of 15 us looks nearly the same."""
+    verdict = verdict_on_winding(0.0, 0.01)
+    assert verdict.parameters.trust == "limited"
+    size = re.search(r"V stands in i as well, ([\d.]+) A/V of it", verdict.parameters.reasons[0])
+    assert size is not None, verdict.parameters.reasons
+    assert float(size[1]) == pytest.approx(0.01, rel=0.25)
+    assert " R 2.2" in verdict.parameters.reasons[0]
