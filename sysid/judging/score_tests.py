@@ -430,11 +430,13 @@ class _Tests:
     def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
         """Whether it is a fault by its size.
 
-        A gain is off by more than what no sensor holds, and a parameter that changes stays above
-        zero where physics asks for that.
+        A gain is off by more than what no sensor holds, crosstalk is little, and a parameter that
+        changes stays above zero where physics asks for that.
         """
         if suspect.kind == "gain":
             return abs(float(result.amplitudes[0])) > _EXACT
+        if suspect.kind == "crosstalk":
+            return abs(float(result.amplitudes[0])) < suspect.most
         limits = self._limits.get(suspect.name) if suspect.kind == "change" else None
         return limits is None or limits[0] < 0.0 or abs(result.amplitudes[0]) < _EMPTIED
 

@@ -5,6 +5,7 @@ and it has not, in their terms. And functions of every state and input in every 
 need no idea of what is missing.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -58,6 +59,7 @@ _LEVELS = 3  # of a signal, below which it shows no function
 _JUMPING, _JUMPING_STATE = 0.05, 1.0
 # Delays that are tested [samples]: of a large one a small one tells little where inputs jump.
 _DELAYS = (0.1, -0.1, -12.0, -4.0, 4.0, 12.0)
+_CROSSTALK = 0.1  # part of an output that is at most what its sensor sees of something else
 _FILTERS = (1.0, 5.0)  # time constants of filters that are tested [samples]
 _PLAYS = (0.02, 0.1)  # parts of an input's peak
 # Deviations of chance by which two levels differ; samples that a signal stands at a level at least,
@@ -92,7 +94,8 @@ class Suspect:
     another, in the outputs' units. late: of a delay or a filter, the change by so many seconds of
     it: where outputs jump that by a little is no guide. of_input: whether a channel is an input.
     mean: of an output that comes late, what it is as a mean over the time since the sample before.
-    closer: the same of sizes beside its own, where those that are tested are far apart.
+    closer: the same of sizes beside its own, where those that are tested are far apart. most: size
+    of an amplitude from which it is something else.
     """
 
     kind: Kind
@@ -104,6 +107,7 @@ class Suspect:
     of_input: bool = False
     mean: Callable[[], "Suspect"] | None = None
     closer: Callable[[], "Sequence[Suspect]"] | None = None
+    most: float = math.inf
 
     @property
     def one_sided(self) -> bool:
@@ -179,7 +183,9 @@ def _crosstalk(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         for name, unit, signal in (each for each in seen if each[0] != output.name):
             changes = _logged(runs, j, signal)[..., None]
             place, by = f"{name} stands in {output.name}", f"{output.unit}/{unit}"
-            yield Suspect("crosstalk", place, by, changes)
+            moved = sum(float(run.outputs[:, j] @ run.outputs[:, j]) for run in runs)
+            share = moved / max(sum(float(signal(run) @ signal(run)) for run in runs), 1e-300)
+            yield Suspect("crosstalk", place, by, changes, most=_CROSSTALK * math.sqrt(share))
 
 
 def _late(
