@@ -453,4 +453,4 @@ def _deviations(record: Dataset) -> FloatArray:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %"
+    return f"{100.0 * share:.2g} %" if share < 0.995 else "100 %"

@@ -179,6 +179,7 @@ def test_a_copy_is_no_validation_whatever_its_name():
         fault = one_fault([record], [copy])
         assert fault.kind == "copy" and fault.voids_validation and not fault.moves_parameters
         assert fault.records == (copy.name,) and "log 0" in fault.statement
+        assert "e+" not in fault.statement
     fault = one_fault([record.part(0, 700, "begin")], [longer])
     assert fault.kind == "copy" and fault.statement.startswith("70 %")
 
