@@ -32,7 +32,7 @@ FaultKind = Literal[
 
 Role = Literal["command", "input", "sensor"]
 
-_COPIED = 0.5  # of a record's moving rows, beyond which it is no other record
+_COPIED = 0.2  # of a record's moving rows, beyond which it is no other record
 _STILL = 0.05  # of the motion in training, below which a record does not move
 _LONG = 10  # samples lost in a row that are many
 _STRAIGHT = 1e-9  # of an input, by which rounding bends a straight line

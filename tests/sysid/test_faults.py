@@ -182,6 +182,9 @@ def test_a_copy_is_no_validation_whatever_its_name():
         assert "e+" not in fault.statement
     fault = one_fault([record.part(0, 700, "begin")], [longer])
     assert fault.kind == "copy" and fault.statement.startswith("70 %")
+    # Of logs that overlap by less the rest is new, and still they are not two.
+    overlapping = one_fault([record.part(0, 550, "begin")], [record.part(350, 900, "end")])
+    assert overlapping.kind == "copy" and overlapping.statement.startswith("36 %")
 
 
 def test_a_copy_in_training_counts_twice():
