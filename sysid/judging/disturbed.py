@@ -161,7 +161,7 @@ class DisturbedRun:
         at_begin, at_end = (
             self._put(i, signal[np.clip(at, 0, last)] - signal) for at in (places, places + 1)
         )
-        added = self._rates_by(at_end) - self._rates_by(at_begin)
+        added = self.rates_by(at_end) - self.rates_by(at_begin)
         even = part**2 if part < 0.5 else 2.0 * part - part**2
         jump = (part - even) * self.record.dt * added
         none = np.zeros_like(jump)
@@ -175,7 +175,7 @@ class DisturbedRun:
         inputs[:, i] = signal
         return inputs
 
-    def _rates_by(self, inputs: FloatArray) -> FloatArray:
+    def rates_by(self, inputs: FloatArray) -> FloatArray:
         """Rates just after each sample, (n_samples, n_states), by what is added to the inputs."""
         moved = self.record.inputs + inputs
         return rates_along(self.model.derivative, self.states, moved, self.vector)

@@ -390,26 +390,16 @@ class _Tests:
                 for i in significant
                 if i != surest and suspects[i].shares_place(suspect)
             ]
-            # A sensor that sees another channel looks much like one that is late, and moves more.
-            nearly = [
-                (i, self._moved(changes[i], results[i][0]))
-                for i in significant
-                if (suspects[i].kind == "crosstalk") != (suspect.kind == "crosstalk")
-                if {suspects[i].kind, suspect.kind} <= {"crosstalk", "delay"}
-                if self._leave_the_same(results[i][1], residual, _NEARLY_SAME)
-            ]
-            instead = [
-                self._finding(suspects[i], results[i][0], [m], logs[i], ()) for i, m in nearly
-            ]
-            moves = [self._moved(changes[surest], result), *alone, *shapes, *(m for _, m in nearly)]
-            same = [
-                suspects[i].name
-                for i in significant
-                if suspect.kind in _SCALES and suspects[i].kind == suspect.kind
-                if i != surest and self._leave_the_same(results[i][1], residual, _SAME)
-            ]
+            same, instead = self._lookalikes(surest, suspects, significant, results, residual)
+            farther = {i: self._moved(changes[i], results[i][0]) for i in instead}
+            moves = [self._moved(changes[surest], result), *alone, *shapes, *farther.values()]
             finding = self._finding(suspect, result, moves, logs[surest], terms)
-            self.findings.append(replace(finding, alike=tuple(same), instead=tuple(instead)))
+            others = [
+                self._finding(suspects[i], results[i][0], [moved], logs[i], ())
+                for i, moved in farther.items()
+            ]
+            finding = replace(finding, alike=tuple(same), instead=tuple(others))
+            self.findings.append(finding)
             size = np.sqrt(np.mean(changes[surest] ** 2, axis=(0, 1)))
             admitted = changes[surest][..., size > 0.0] / size[size > 0.0]
             self._columns = np.concatenate([self._columns, admitted], axis=2)
@@ -417,6 +407,29 @@ class _Tests:
             self._ends.append(len(self._free))
             self._recolour(residual)
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
+
+    def _lookalikes(
+        self,
+        surest: int,
+        suspects: Sequence[Suspect],
+        significant: Sequence[int],
+        results: Mapping[int, tuple[Regressed, FloatArray]],
+        residual: FloatArray,
+    ) -> tuple[list[str], list[int]]:
+        """Channels of which the surest suspect's fault is the same, and places of nearly the same.
+
+        A sensor that sees another channel looks much like one that is late, and moves more.
+        """
+        kind, same, nearly = suspects[surest].kind, list[str](), list[int]()
+        for i in (i for i in significant if i != surest):
+            alike, left = suspects[i].kind == kind, results[i][1]
+            if alike and kind in _SCALES and self._leave_the_same(left, residual, _SAME):
+                same.append(suspects[i].name)
+            if {suspects[i].kind, kind} == {"crosstalk", "delay"} and self._leave_the_same(
+                left, residual, _NEARLY_SAME
+            ):
+                nearly.append(i)
+        return same, nearly
 
     def _leave_the_same(self, residual: FloatArray, another: FloatArray, tolerance: float) -> bool:
         """Whether two suspects, by what each leaves, (n, n_outputs), explain nearly the same.

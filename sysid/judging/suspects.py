@@ -177,15 +177,25 @@ def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
 def _crosstalk(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     """Outputs whose sensors see an input without noise, or another output, as well."""
     model, exact = runs[0].model, runs[0].record.input_noise == 0.0
-    seen = [(s.name, s.unit, partial(_input, i)) for i, s in enumerate(model.inputs) if exact[i]]
-    seen += [(s.name, s.unit, partial(_output, j)) for j, s in enumerate(model.outputs)]
+    channels = [
+        (s.name, s.unit, partial(_input, i)) for i, s in enumerate(model.inputs) if exact[i]
+    ]
+    channels += [(s.name, s.unit, partial(_output, j)) for j, s in enumerate(model.outputs)]
+    seen = [(*channel, _rms(runs, channel[2])) for channel in channels]
+    sizes = {name: size for name, _, _, size in seen}
     for j, output in enumerate(model.outputs):
-        for name, unit, signal in (each for each in seen if each[0] != output.name):
+        for name, unit, signal, size in seen:
+            if name == output.name or not size:
+                continue
             changes = _logged(runs, j, signal)[..., None]
             place, by = f"{name} stands in {output.name}", f"{output.unit}/{unit}"
-            moved = sum(float(run.outputs[:, j] @ run.outputs[:, j]) for run in runs)
-            share = moved / max(sum(float(signal(run) @ signal(run)) for run in runs), 1e-300)
-            yield Suspect("crosstalk", place, by, changes, most=_CROSSTALK * math.sqrt(share))
+            most = _CROSSTALK * sizes[output.name] / size
+            yield Suspect("crosstalk", place, by, changes, most=most)
+
+
+def _rms(runs: Sequence[DisturbedRun], signal: Callable[[DisturbedRun], FloatArray]) -> float:
+    """Root mean square of a signal (n_samples,) along all runs."""
+    return float(np.sqrt(np.mean(np.concatenate([signal(run) for run in runs]) ** 2)))
 
 
 def _late(

@@ -160,11 +160,9 @@ def _as_input(run: DisturbedRun, i: int) -> tuple[float, str]:
         span = float(np.abs(run.record.inputs[:, k]).max())
         if span == 0.0:
             continue
-        moved = run.record.inputs.copy()
-        moved[:, k] += _PROBE * span
-        slopes = (
-            rates_along(run.model.derivative, run.states, moved, run.vector) - run.rates.after
-        )[:, i] / (_PROBE * span)
+        moved = np.zeros_like(run.record.inputs)
+        moved[:, k] = _PROBE * span
+        slopes = (run.rates_by(moved) - run.rates.after)[:, i] / (_PROBE * span)
         size = float(np.abs(slopes).max())
         if size > 0.0 and float(np.ptp(slopes)) < _PROBE * size:
             return 1.0 / size, given.unit

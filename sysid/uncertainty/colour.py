@@ -77,7 +77,7 @@ def colour(
         return plain
     slow = tuple(None if each is None else each.noise for each in hidden)
     without, filtered, sizes = residual.copy(), residual.copy(), 0.0
-    filters = Autoregression(plain.coefficients, plain.noise, slow).filters(seen, lengths)
+    filters = replace(plain, slow=slow).filters(seen, lengths)
     for j, each in enumerate(hidden):
         if each is not None:
             without[:, j] = each.without
