@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from sysid.arrays import FloatArray
 from sysid.engine.linear_response import LinearResponse, feedthrough, free_response, observed
@@ -25,6 +26,7 @@ from sysid.problem.preparation import at_places
 from sysid.threads import Workers
 
 _FINE = 4  # steps of the integration in a sample, for what is to differ from another run alone
+_BEYOND = 12  # samples by which a signal goes straight on, to be shifted: splines forget in fewer
 _FELT = 1e-3  # part of an output's motion that inputs without noise do at least, or it is none
 
 
@@ -240,9 +242,14 @@ def _averaged(record: Dataset) -> list[int]:
 
 
 def shifted(signal: FloatArray, samples: float, held: bool) -> FloatArray:
-    """Change of a signal that is taken so many samples later."""
-    places = np.clip(np.arange(len(signal)) + samples, 0.0, len(signal) - 1.0)
-    return at_places(signal, places, held) - signal
+    """Change of a signal that is taken so many samples later, (n_samples,)."""
+    if held:
+        places = np.clip(np.arange(len(signal)) + samples, 0.0, len(signal) - 1.0)
+        return at_places(signal, places, held) - signal
+    # Splines of evenly spaced samples, which go straight on beyond their ends.
+    padded = np.pad(signal, _BEYOND, mode="reflect", reflect_type="odd")
+    later: FloatArray = ndimage.shift(padded, -samples, order=3, mode="nearest")
+    return later[_BEYOND:-_BEYOND] - signal
 
 
 def of_each(

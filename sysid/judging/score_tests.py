@@ -55,7 +55,7 @@ from sysid.judging.whitener import Whitener
 from sysid.problem.terms import AddedTerm
 from sysid.threads import Workers
 from sysid.uncertainty import Estimate, Uncertainty
-from sysid.uncertainty.colour import colour
+from sysid.uncertainty.colour import Autoregression, colour, fast_colour
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
     sensitivity,
@@ -534,15 +534,15 @@ class _Tests:
         left: what that leaves. Each by its own colour, with lines and all: the suspect may be
         what slow noise does in a record, and no slow noise is left of it then.
         """
-        ratio = self._deviance - self._deviance_of(left)
+        ratio = self._deviance - self._colour_of(left).deviance
         chance = float(chdtrc(freedom, max(ratio, 0.0)))
         return math.log(chance) if chance > 0.0 else -math.inf
 
-    def _deviance_of(self, residual: FloatArray) -> float:
-        """Minus twice the logarithm of the likelihood of residuals, by their colour."""
-        local = self._local
+    def _colour_of(self, residual: FloatArray) -> Autoregression:
+        """Colour of residuals with all that is straight in them."""
+        local, of = self._local, colour if self._slow else fast_colour
         counted = local.seen & (local.objective.weights > 0.0)
-        return colour(np.where(counted, residual, 0.0), local.seen, local.lengths).deviance
+        return of(np.where(counted, residual, 0.0), local.seen, local.lengths)
 
     def _as_late(
         self, suspect: Suspect, result: Regressed, residual: FloatArray
@@ -622,12 +622,15 @@ class _Tests:
 
     def _recolour(self, residual: FloatArray) -> None:
         """Take the colour of what the columns leave, or leave nearly, for that of the noise."""
+        self._slow = True
         self._regression = self._coloured_by(residual)
-        rest = self._residual - self._columns @ self._regression.coefficients
-        self._deviance = self._deviance_of(rest)
+        rest = self._colour_of(self._residual - self._columns @ self._regression.coefficients)
+        self._deviance = rest.deviance
+        # What a suspect explains may be slow; what it leaves is not where nothing is.
+        self._slow = bool(rest.slow or self._regression.whitening.model.slow)
 
     def _coloured_by(self, residual: FloatArray) -> Regression:
-        whitening = Whitener.of(self._local, residual)
+        whitening = Whitener.of(self._local, residual, self._slow)
         return Regression(whitening, self._columns, self._free, self._residual, self._noises)
 
     def _terms(

@@ -32,14 +32,17 @@ class Whitener:
     filters: Mapping[int, SlowFilter] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, local: Sensitivity, residual: FloatArray) -> Self:
-        """By residuals (n_residuals, n_outputs); of outputs that do not count none are left."""
+    def of(cls, local: Sensitivity, residual: FloatArray, slow: bool = True) -> Self:
+        """By residuals (n_residuals, n_outputs); of outputs that do not count none are left.
+
+        slow: whether their noise may have a slow part.
+        """
         counted = local.objective.weights > 0.0
         measured = counted & local.seen
         residual = np.where(measured, residual, 0.0)
         if local.corrects:
             return cls._of_innovations(local, residual)
-        model = colour_about_line(residual, local.seen, measured, local.lengths)
+        model = colour_about_line(residual, local.seen, measured, local.lengths, slow)
         return cls.by(model, local.seen, local.lengths)
 
     @classmethod
@@ -141,13 +144,18 @@ class Whitener:
 
 
 def colour_about_line(
-    residual: FloatArray, seen: BoolArray, measured: BoolArray, lengths: tuple[int, ...]
+    residual: FloatArray,
+    seen: BoolArray,
+    measured: BoolArray,
+    lengths: tuple[int, ...],
+    slow: bool = True,
 ) -> Autoregression:
     """Colour of residuals (n, q) about offset and drift, of outputs that these tell more of.
 
     They are no colour: an autoregression would take them for a memory without end, and whitening
     would erase them. Of noise as slow as a record they are part; Schwarz's criterion decides. Each
-    record has a line of its own: what is off in one of several is no slow noise of all.
+    record has a line of its own: what is off in one of several is no slow noise of all. slow:
+    whether noise may have a slow part.
     """
     line = np.zeros_like(residual)
     for rows in record_rows(lengths):
@@ -158,18 +166,23 @@ def colour_about_line(
             line[at, j] = residual[at, j].mean() + slope * time
     columns = range(residual.shape[1])
     straight = [
-        _is_straight(residual[:, [j]], line[:, [j]], seen[:, [j]], lengths) for j in columns
+        _is_straight(residual[:, [j]], line[:, [j]], seen[:, [j]], lengths, slow) for j in columns
     ]
-    return colour(residual - np.where(straight, line, 0.0), seen, lengths)
+    whole = colour if slow else fast_colour
+    return whole(residual - np.where(straight, line, 0.0), seen, lengths)
 
 
 def _is_straight(
-    residual: FloatArray, line: FloatArray, seen: BoolArray, lengths: tuple[int, ...]
+    residual: FloatArray,
+    line: FloatArray,
+    seen: BoolArray,
+    lengths: tuple[int, ...],
+    slow: bool,
 ) -> bool:
     """Whether lines through an output's residuals, (n, 1), are more than slow noise makes of it."""
     lines = _OF_A_LINE * len(lengths) * math.log(max(len(residual), 2))
     # Beside slow noise a line is worth no more than it is without, and that is sooner asked.
     return bool(line.any()) and all(
         of(residual - line, seen, lengths).criterion + lines < of(residual, seen, lengths).criterion
-        for of in (fast_colour, colour)
+        for of in (fast_colour, *([colour] if slow else []))
     )

@@ -399,7 +399,8 @@ class _Analysis:
         self.pushed = self._pushed_by(Z95)
         self.covariance = self.free
         if self.pushed.any():
-            self.covariance = covariance(local, structure.directions, self.pushed)
+            simulated = self.free.simulated
+            self.covariance = covariance(local, structure.directions, self.pushed, simulated)
         self.gradients: dict[str, FloatArray] = {}
         self.combined: dict[str, Invariant] = {}
         self.alike: list[FloatArray] = []

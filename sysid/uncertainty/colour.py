@@ -114,11 +114,12 @@ def _autoregression(
     q = residual.shape[1]
     largest = _largest_order(whole, lengths, q)
     y, past = _regression(residual, whole, lengths, largest)
-    basis = np.linalg.qr(past)[0]
+    # Below the columns of an order's past stands what these leave of the residuals.
+    triangle: FloatArray = np.asarray(np.linalg.qr(np.hstack([past, y]), mode="r"))
+    left = triangle[:, largest * q :]
     best, lowest, deviance = 0, math.inf, math.inf
     for order in range(largest + 1):
-        part = basis[:, : order * q]
-        noise = _covariance(y - part @ (part.T @ y), order)
+        noise = _covariance(left[order * q :], len(y), order)
         # A tiny part of its own: an output that never errs has no logarithm.
         sign, size = np.linalg.slogdet(noise + 1e-300 * np.eye(q))
         criterion = float(len(y) * size + np.log(max(len(y), 2)) * order * q * q)
@@ -126,7 +127,7 @@ def _autoregression(
             best, lowest, deviance = order, criterion, float(len(y) * size)
     y, past = _regression(residual, whole, lengths, best)
     solution = np.asarray(np.linalg.lstsq(past, y, rcond=None)[0], dtype=np.float64)
-    noise = _covariance(y - past @ solution, best)
+    noise = _covariance(y - past @ solution, len(y), best)
     coefficients = np.moveaxis(solution.reshape(best, q, q), 1, 2)
     return Autoregression(_decaying(coefficients, len(y)), noise, (), deviance, lowest)
 
@@ -258,12 +259,10 @@ def _largest_order(whole: BoolArray, lengths: Sequence[int], q: int) -> int:
 
 def _usable(whole: BoolArray, lengths: Sequence[int], order: int) -> BoolArray:
     """Samples that were measured, as were ``order`` before them in their record, (n,)."""
-    usable = whole.copy()
-    for rows in record_rows(lengths):
-        measured, counted = whole[rows], usable[rows]
-        for k in range(1, order + 1):
-            counted[k:] &= measured[: max(len(measured) - k, 0)]
-        counted[:order] = False
+    before_first = np.repeat([rows.start - 1 for rows in record_rows(lengths)], lengths)
+    places = np.arange(len(whole))
+    lost = np.maximum.accumulate(np.where(whole, before_first, places))
+    usable: BoolArray = places - lost > order
     return usable
 
 
@@ -292,8 +291,9 @@ def _decaying(coefficients: FloatArray, samples: int) -> FloatArray:
     return shrunk
 
 
-def _covariance(e: FloatArray, order: int) -> FloatArray:
-    covariance: FloatArray = e.T @ e / max(len(e) - order * e.shape[1], 1)
+def _covariance(e: FloatArray, samples: int, order: int) -> FloatArray:
+    """Of what an autoregression leaves of so many samples, or of rows of the same products."""
+    covariance: FloatArray = e.T @ e / max(samples - order * e.shape[1], 1)
     return covariance
 
 

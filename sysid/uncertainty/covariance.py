@@ -34,20 +34,34 @@ _PART = 1e-3
 
 
 @dataclass(frozen=True)
+class SimulatedScore:
+    """Covariance of the score by what simulations tell, whatever the residuals' colour.
+
+    by_inputs: (n_free, n_free), by noise of the inputs, which residuals hold as well; by_rest: by
+    all that they do not hold.
+    """
+
+    by_inputs: FloatArray
+    by_rest: FloatArray
+
+
+@dataclass(frozen=True)
 class Covariance:
     """Covariance ``matrix`` (n_free, n_free) of the search coordinates, up to the ties.
 
     Of what the ``ties`` (n, n_free) leave alone it is the covariance; of the tied themselves it
-    says nothing. score: (n_free, n_free), covariance of the error's slope, by which that is.
-    curvature: what it would be of white residuals of unit weight. newton_step: (n_free,), to
-    where slopes and curvature have the minimum, beyond the ends of ranges too. flat: (n, n_free),
-    orthonormal, further directions that do not move the outputs, in coordinates times ``sizes``,
-    (n_free,). singular_values: of the rest of the sensitivity, its columns of length one,
-    falling. spread: between logs, or parts of one, where it is more than chance.
+    says nothing. score: (n_free, n_free), covariance of the error's slope, by which that is;
+    simulated: what simulations tell of it. curvature: what it would be of white residuals of unit
+    weight. newton_step: (n_free,), to where slopes and curvature have the minimum, beyond the ends
+    of ranges too. flat: (n, n_free), orthonormal, further directions that do not move the outputs,
+    in coordinates times ``sizes``, (n_free,). singular_values: of the rest of the sensitivity, its
+    columns of length one, falling. spread: between logs, or parts of one, where it is more than
+    chance.
     """
 
     ties: FloatArray
     score: FloatArray
+    simulated: SimulatedScore
     matrix: FloatArray
     curvature: FloatArray
     newton_step: FloatArray
@@ -95,24 +109,29 @@ def covariance(
     sensitivity: Sensitivity,
     ties: FloatArray,
     held: BoolArray | None = None,
+    simulated: SimulatedScore | None = None,
     score: FloatArray | None = None,
 ) -> Covariance:
     """Covariance at an identified chromosome.
 
     ties: (n, n_free), directions of the coordinates that leave the outputs of any data alone.
-    held: (n_free,), parameters whose value a bound decides. score: that of another covariance of
-    the same sensitivity, which simulations need not tell once more.
+    held: (n_free,), parameters whose value a bound decides. simulated: that of another covariance
+    of the same sensitivity, which need not be simulated once more; score: likewise, where the
+    residuals' colour is to be the same as well.
     """
     residual, slopes = sensitivity.residual, sensitivity.slopes
     weight = sensitivity.objective.least_squares_weights(residual)
     weighted = slopes * weight[:, None]
+    if simulated is None:
+        simulated = _simulated_score(sensitivity, weight, weighted, ties)
     if score is None:
-        score = _score(sensitivity, weight, weighted, ties, held)
+        score = _score(sensitivity, weighted, held, simulated)
     felt = _felt(sensitivity, weight, ties, held)
     inverse = felt.back @ felt.back.T
     return Covariance(
         ties,
         score,
+        simulated,
         inverse @ score @ inverse,
         inverse,
         _foretold(sensitivity, weight, felt),
@@ -162,10 +181,9 @@ def _foretold(local: Sensitivity, weight: FloatArray, felt: _Felt) -> FloatArray
 
 def _score(
     sensitivity: Sensitivity,
-    weight: FloatArray,
     weighted: FloatArray,
-    ties: FloatArray,
     held: BoolArray | None,
+    simulated: SimulatedScore,
 ) -> FloatArray:
     """Covariance of the score by all noise, (n_free, n_free).
 
@@ -178,15 +196,20 @@ def _score(
     noise = colour(residual, seen, lengths, fitted)
     score = score_covariance(weighted, seen, lengths, noise, residual)
     # Not all that the inputs' noise does is seen in residuals: parameters take up slow changes.
-    score = larger(score, _score_covariance_by_inputs(sensitivity, weighted))
+    return larger(score, simulated.by_inputs) + simulated.by_rest
+
+
+def _simulated_score(
+    sensitivity: Sensitivity, weight: FloatArray, weighted: FloatArray, ties: FloatArray
+) -> SimulatedScore:
+    """What simulations tell of the score's covariance; weighted: slopes times weights."""
+    by_inputs = _score_covariance_by_inputs(sensitivity, weighted)
     starts = (change for _, change in start_errors(sensitivity))
     constant = zero_errors(sensitivity), starts, parabola_errors(sensitivity)
-    for errors in (*constant, averages_errors(sensitivity), bend_errors(sensitivity)):
-        score += _score_covariance_by(weighted, errors)
-    pushes = np.array([*noise_pushes(sensitivity, weight, ties)])
-    pushes = pushes.reshape(-1, weighted.shape[2])
-    score += pushes.T @ pushes
-    return score
+    errors = (*constant, averages_errors(sensitivity), bend_errors(sensitivity))
+    pushes = [_score_covariance_by(weighted, each) for each in errors]
+    raised = np.array([*noise_pushes(sensitivity, weight, ties)]).reshape(-1, weighted.shape[2])
+    return SimulatedScore(by_inputs, sum(pushes, raised.T @ raised))
 
 
 def noise_pushes(local: Sensitivity, weight: FloatArray, ties: FloatArray) -> Iterator[FloatArray]:

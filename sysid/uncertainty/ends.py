@@ -83,7 +83,7 @@ class RangeEnds:
         ties = self.free.ties
         if len(ties):
             ties = null_space(ties[:, held].T).T @ ties
-        return covariance(self.local, ties, held, self.free.score)
+        return covariance(self.local, ties, held, self.free.simulated, self.free.score)
 
     def _moved(self, freed: Sequence[int], passed: Sequence[int]) -> FloatArray | None:
         """Search coordinates, (n_free,), of the minimum by slopes with some parameters freed.
