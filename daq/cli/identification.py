@@ -63,17 +63,14 @@ def show_identification(
 
 
 @contextlib.contextmanager
-def drafting(report: bool) -> Iterator[Draft | None]:
-    """A draft of a report that is wanted."""
-    if not report:
-        yield None
-        return
+def drafting(report: bool) -> Iterator[Draft]:
+    """What a second process does meanwhile, of a report as well where that is wanted."""
     from daq.second_process import SecondProcess
 
     with SecondProcess() as second:
         from daq.identification.draft import Draft  # while that begins
 
-        yield Draft(second)
+        yield Draft(second, report)
 
 
 def _publish(result: Identification, json: bool, draft: Draft | None) -> dict[str, str]:

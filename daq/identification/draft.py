@@ -33,19 +33,21 @@ if TYPE_CHECKING:
 
 
 class Draft:
-    """What a second process does for one identification."""
+    """What a second process does for one identification; report: whether there will be one."""
 
-    def __init__(self, second: SecondProcess) -> None:
-        self.second = second
+    def __init__(self, second: SecondProcess, report: bool = True) -> None:
+        self.second, self._report = second, report
         self._data: LinearData | None = None
+        self._compiled: Job[None] | None = None
         self._linear: list[Job[list[Baseline] | str]] = []
 
     def begin(self, problem: Problem, logs: Split) -> None:
-        """Have what is wanted after the search compiled or loaded, and baselines fitted."""
+        """Have what is wanted after the search compiled or loaded, and what a report compares."""
         request = pickle.dumps(problem.request)
-        self.second.call(_compiled_ahead, request, logs[0][0].dataset)
-        self._data = LinearData.of(problem.model, *logs)
-        self._linear = [self.second.call(of_inputs, self._data)]
+        self._compiled = self.second.call(_compiled_ahead, request, logs[0][0].dataset)
+        if self._report:
+            self._data = LinearData.of(problem.model, *logs)
+            self._linear = [self.second.call(of_inputs, self._data)]
 
     def baselines(self, model: ProcessModel, logs: Split) -> list[Baseline] | str:
         """Those of the logs, or why there are none."""
@@ -72,14 +74,14 @@ class Draft:
         def here(uncertainty: Uncertainty) -> tuple[Finding, ...]:
             return score_tests_of(estimator, training).findings(uncertainty)
 
-        free = self._linear and self._linear[0].is_answered
-        if not free:
+        begun = (self._compiled, *self._linear)
+        if not all(job is not None and job.is_answered for job in begun):
             return here
         fit = pickle.dumps(problem.request), _without_models((estimator, list(training)))
-        begun = self.second.call(_begun, *fit)
+        tests = self.second.call(_begun, *fit)
 
         def findings(uncertainty: Uncertainty) -> tuple[Finding, ...]:
-            if not begun.result():
+            if not tests.result():
                 return here(uncertainty)
             job = self.second.call(_findings, *fit, uncertainty)
             self._go_on()

@@ -12,9 +12,11 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.special import fdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.alternatives import Alternative
+from sysid.judging.evidence import independent_samples
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.findings import MOVED, Finding, description
 from sysid.judging.phrases import change, sized
@@ -63,8 +65,10 @@ _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of
 class RecordResult:
     """A model's errors on a record; ``simulated``: whether its free run came to the end.
 
-    floor: residuals in parts of what a right model leaves; noise: in parts of what one leaves whose
-    parameters are known exactly; None where nothing is known of that.
+    independent: (n_outputs,), how many independent samples would tell the mean square of each
+    output's residuals as surely. floor: residuals in parts of what a right model leaves; noise: in
+    parts of what one leaves whose parameters are known exactly; None where nothing is known of
+    that.
     starts: initial states that were estimated from the record. shared, by_speed: (n_outputs,),
     correlations as of ``shared_errors`` and ``errors_by_speed``; None where they were not tested.
     alone: (n_outputs,), shares as of ``errors_alone``; None of a run that did not come to the end.
@@ -74,6 +78,7 @@ class RecordResult:
     simulated: bool
     metrics: Metrics
     residuals: ResidualTest
+    independent: FloatArray
     floor: FloorTest | None = None
     noise: FloorTest | None = None
     starts: Starts | None = None
@@ -158,6 +163,7 @@ def examine(
         residual_test(
             residual, record.inputs, record.input_noise, systematic=systematic, later=later
         ),
+        np.array([independent_samples([e[np.isfinite(e), None]]) for e in residual.T]),
         None if expected is None else floor_test(residual, expected),
         None if expected is None else floor_test(residual, expected.of_exact_parameters),
         starts,
@@ -244,10 +250,11 @@ def _prediction(
     poor, excused = _poor_fits(model, validation, "on the validation data")
     grave += poor.values()
     light += excused.values()
-    for name, ratio, beyond, at_floor in _validation_errors(model, training, validation):
-        if ratio > _HARDLY_WORSE and beyond > _SMALL and not at_floor and name not in poor:
-            reasons = grave if ratio > _FAR_WORSE and beyond > _HARDLY_WORSE * _SMALL else light
-            reasons.append(f"{name} errs {ratio:.1f} times as much in validation as in training.")
+    for output in _worse_in_validation(model, training, validation):
+        if not output.at_floor and output.name not in poor:
+            far = output.ratio > _FAR_WORSE and output.beyond > _HARDLY_WORSE * _SMALL
+            reasons = grave if far else light
+            reasons.append(f"{output.times_as_much} in validation as in training.")
     voided = [f.sentence for f in faults if f.severity == "doubt" and f.voids_validation]
     if voided:
         light += voided
@@ -343,13 +350,29 @@ def _failed_runs(model: ProcessModel, results: Sequence[RecordResult]) -> Iterat
         )
 
 
-def _validation_errors(
-    model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
-) -> list[tuple[str, float, float, bool]]:
-    """Of each output its name, its error in validation in parts of that in training, and two more:
+@dataclass(frozen=True)
+class _Worse:
+    """An output that errs more in validation than in training.
 
-    by how much it is larger, in parts of the output's deviation; whether it is noise alone.
+    ratio: of both errors; beyond: by how much it is larger, in parts of the output's deviation;
+    at_floor: whether it is noise alone.
     """
+
+    name: str
+    ratio: float
+    beyond: float
+    at_floor: bool
+
+    @property
+    def times_as_much(self) -> str:
+        """How much more it errs, in words."""
+        return f"{self.name} errs {self.ratio:.1f} times as much"
+
+
+def _worse_in_validation(
+    model: ProcessModel, training: Sequence[RecordResult], validation: Sequence[RecordResult]
+) -> list[_Worse]:
+    """Outputs that err more in validation than in training, by more than chance."""
     if not validation:
         return []
     # Absolute, because each record has its own largest output.
@@ -358,14 +381,19 @@ def _validation_errors(
         for results in (training, validation)
     )
     fits = mean_known([r.metrics.fit for r in validation], 0)
+    count, base = (
+        np.sum([r.independent for r in results], axis=0) for results in (validation, training)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = validated / trained
         # A fit of 90 % is an error of a tenth of the deviation.
         beyond = (1.0 - fits / 100.0) * np.sqrt(np.maximum(1.0 - 1.0 / ratios**2, 0.0))
+        sure = fdtrc(count, base, ratios**2) < _BY_CHANCE
+        worse = (ratios > _HARDLY_WORSE) & (beyond > _SMALL) & sure
     floor = ~_above_floor(validation) & _known(validation)
-    columns = (ratios, beyond)
-    values = zip(*(column.tolist() for column in columns), floor.tolist(), strict=True)
-    return [(name, *row) for name, row in zip(model.output_names, values, strict=True)]
+    values = zip(ratios.tolist(), beyond.tolist(), floor.tolist(), strict=True)
+    outputs = [_Worse(n, *row) for n, row in zip(model.output_names, values, strict=True)]
+    return [outputs[j] for j in np.flatnonzero(worse)]
 
 
 def _known(results: Sequence[RecordResult]) -> BoolArray:
@@ -688,9 +716,8 @@ def _praise(
     chance, sizes = _input_correlations(validation)
     traces = sizes[chance < _BY_CHANCE]
     worse = [
-        f"{name} errs {ratio:.1f} times as much as in training"
-        for name, ratio, beyond, _ in _validation_errors(model, training, validation)
-        if ratio > _HARDLY_WORSE and beyond > _SMALL
+        f"{output.times_as_much} as in training"
+        for output in _worse_in_validation(model, training, validation)
     ]
     as_well = "parameters known so well explain them" if worse else "those that were"
     details = "; ".join([f"mean fit {fit:.1f} %", *worse])

@@ -72,7 +72,7 @@ def independent_samples(residuals: Sequence[FloatArray]) -> float:
     """
     n = sum(map(len, residuals))
     joined = np.concatenate(residuals)
-    values, vectors = np.linalg.eigh(joined.T @ joined / n)
+    values, vectors = np.linalg.eigh(joined.T @ joined / max(n, 1))
     kept = values > 1e-12 * values.max(initial=0.0)
     if not kept.any():
         return float(n)

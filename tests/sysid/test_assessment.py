@@ -169,6 +169,14 @@ def test_errors_that_grow_in_validation_count_by_how_much(ratio, trust):
         assert float(reason.split()[2]) == pytest.approx(ratio, abs=0.15)
 
 
+@pytest.mark.parametrize(("pole", "told"), [(0.0, True), (0.99, False)])
+def test_errors_that_are_larger_by_chance_in_validation_are_no_reason(pole, told):
+    # As if of 600 samples, and of three.
+    judged = verdict([wandering(1, 0.1, pole)], [wandering(2, 0.14, pole)])
+    worse = [r for r in judged.predicted.reasons if "speed errs 1.4 times as much in val" in r]
+    assert bool(worse) == told
+
+
 def test_errors_are_compared_in_their_own_unit_over_all_records():
     # The validation is ten times smaller; its error in parts of its peak ten times larger.
     small = result(2, (NOISE, NOISE), size=0.5)
