@@ -23,6 +23,7 @@ course depends on nothing but itself, whatever others share its batches.
 """
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -60,6 +61,10 @@ MOST_ITERATIONS = 50
 ROUNDING = 1e-12  # errors below it are those of the arithmetic
 _KEPT = 0.02  # share of the promise below which a gain counts as a failure
 _CRAWL = 0.2  # and below which it gets nowhere soon
+_LAST, _QUICKER = (
+    3,
+    5.0,
+)  # iterations that tell a descent's pace, and times it that it may yet come to
 _LITTLE = 0.5  # share of the promise below which the valley bends
 _FAR = 0.05  # parts of the ranges; after longer moves the integration steps are chosen anew
 _BURST = 10.0  # a neighbour's error that is so much larger has left the edge of stability
@@ -113,19 +118,23 @@ def refine_each(
     descents: Sequence[Descent],
     max_iterations: int = MOST_ITERATIONS,
     enough: Callable[[Point], bool] = lambda point: False,
+    goal: float = math.inf,
 ) -> list[Refinement]:
     """The same by several descents that begin, side by side in the same batches.
 
-    enough: whether a descent that has come to a point need not go on.
+    enough: whether a descent that has come to a point need not go on. goal: an error below which
+    ends are of interest: no descent goes on that will not come to it at several times its pace.
     """
-    descents = list(descents)
-    for _ in range(max_iterations):
+    descents, errors = list(descents), [list[float]() for _ in descents]
+    for iteration in range(1, max_iterations + 1):
         live = [i for i, descent in enumerate(descents) if not descent.finished]
         if not live:
             break
         descents = advance(objective, descents)
         for i in live:
-            if descents[i].is_given_up or enough(descents[i].point):
+            errors[i].append(descents[i].point.error)
+            slow = _is_too_slow(errors[i], max_iterations - iteration, goal)
+            if slow or descents[i].is_given_up or enough(descents[i].point):
                 descents[i] = replace(descents[i], finished=True)
     points = [descent.point for descent in descents]
     ends = [objective.space.decode(point.at) for point in points]
@@ -137,6 +146,19 @@ def refine_each(
         Refinement(end, descent.point.error, errors, descent.iterations, _final_steps(descent))
         for end, descent, errors in zip(ends, descents, rms, strict=True)
     ]
+
+
+def _is_too_slow(errors: Sequence[float], left: int, goal: float) -> bool:
+    """Whether a descent of such errors stays above a goal in the iterations that are left.
+
+    At several times the pace of its last iterations, unless that becomes ever quicker: plateaus
+    end, and bent valleys may straighten.
+    """
+    if len(errors) <= _LAST or not goal < errors[-1] < math.inf:
+        return False
+    gains = -np.diff(np.log(errors[-1 - _LAST :]))
+    lacking = math.log(errors[-1] / goal)
+    return bool(gains[-1] <= gains[:-1].max() and lacking > _QUICKER * gains.max() * left)
 
 
 def _final_steps(descent: Descent) -> tuple[int, ...]:

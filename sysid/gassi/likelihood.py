@@ -463,9 +463,10 @@ def _conceivable(
             easier = objective.eased(best.chromosome, _MOVING)
             starts = _conceivable_by(excerpt, easier, starts, optima, best)
     here = best.by(objective)
+    goal = optima.error_at(objective, here, _CONCEIVABLE)
     return [
         end
-        for end in _quickly(objective, starts, optima.new)
+        for end in _quickly(objective, starts, optima.new, goal)
         if optima.deviance(Optimum.of(objective, end.chromosome, end.rms), here) < _CONCEIVABLE
     ]
 
@@ -501,9 +502,10 @@ def _conceivable_by(
         there, *ends = on_all([chromosome, *others])
         return optima.new(there, ends)
 
-    ends = _quickly(part, begun, new)
     share = excerpt.n_samples / sum(record.n_samples for record in objective.records)
-    minimum, *reached = (Optimum.of(part, end.chromosome, end.rms) for end in [first, *ends])
+    minimum = Optimum.of(part, first.chromosome, first.rms)
+    ends = _quickly(part, begun, new, optima.error_at(part, minimum, _CONCEIVABLE / share))
+    reached = (Optimum.of(part, end.chromosome, end.rms) for end in ends)
     near = [o for o in reached if share * optima.deviance(o, minimum) < _CONCEIVABLE]
     return on_all(chromosomes_of(near)) if near else []
 
@@ -512,8 +514,12 @@ def _quickly(
     objective: Objective,
     starts: Sequence[FloatArray],
     new: _New,
+    goal: float,
 ) -> list[Refinement]:
-    """Where descents come to soon that is new, also to those before them; others end on the way."""
+    """Where descents come to soon that is new, also to those before them; others end on the way.
+
+    goal: as of ``refine_each``.
+    """
     ends: list[Refinement] = []
     for first in range(0, len(starts), _AT_ONCE):
         before = [end.chromosome for end in ends]
@@ -525,6 +531,7 @@ def _quickly(
             descents,
             max_iterations=QUICKLY,
             enough=partial(_known, objective, new, before),
+            goal=goal,
         )
         for end in sorted(wave, key=lambda end: end.error):
             if new(end.chromosome, [kept.chromosome for kept in ends]):

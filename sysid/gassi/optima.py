@@ -1,5 +1,6 @@
 """Minima of an objective, compared by the likelihood that each has by its own weights."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -126,6 +127,14 @@ class Optima:
     def deviance(self, optimum: Optimum, reference: Optimum) -> float:
         """Twice the logarithm of the likelihood ratio of the reference and the optimum."""
         return self._deviance(optimum.rms, reference.rms)
+
+    def error_at(self, objective: Objective, optimum: Optimum, deviance: float) -> float:
+        """Error, by an objective, of a minimum that is less likely than one by so much, and more.
+
+        Were all outputs to err more alike, by twice as much.
+        """
+        error = float(objective.error_of(optimum.rms[None])[0])
+        return error * math.exp(deviance / float(np.sum(self._independent_samples)))
 
     def _deviance(self, rms: FloatArray, reference: FloatArray) -> float:
         sizes = np.log(np.maximum([rms, reference], TINY)) - np.log(self._scale)

@@ -579,6 +579,22 @@ def test_a_descent_that_crawls_far_from_its_goal_is_given_up(monkeypatch):
     assert cut.iterations == 5 < end.iterations
 
 
+def test_a_descent_too_slow_for_its_goal_ends_and_one_on_a_plateau_does_not():
+    # For the first seven iterations it gains next to nothing, and after ten nothing.
+    bell = gain_objective(
+        Formula,
+        lambda p, u: 2.0 * np.exp(-((p["gain"] - 3.0) ** 2)) * u,
+        2.0 * SINE[:, None] + 0.01,
+    )
+    free, coming, hopeless = (
+        refine_each(bell, [begin(bell, np.array([0.2]), tolerance=1e-12)], 40, goal=goal)[0]
+        for goal in (np.inf, 0.02, 1e-3)
+    )
+    assert coming.error == free.error < 0.01
+    assert hopeless.iterations < coming.iterations
+    assert hopeless.error == pytest.approx(free.error, rel=1e-2)
+
+
 class InTwoSteps(Formula):
     def steps_of_each(self, vectors, record):
         return np.full(len(vectors), 2)
