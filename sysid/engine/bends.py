@@ -53,6 +53,37 @@ def in_parts(model: ProcessModel, inputs: FloatArray, parts: int) -> FloatArray:
     return fine
 
 
+def with_changes(fine: FloatArray, record: Dataset, parts: int) -> FloatArray:
+    """Inputs as of ``in_parts`` with what held ones do between the samples of a record.
+
+    >>> held = Dataset(np.zeros(3), np.zeros(3), 0.1, changes=np.ones((3, 1)),
+    ...     last_part=np.array([0.25]))
+    >>> with_changes(np.zeros((9, 1)), held, 4)[:, 0].tolist()
+    [-0.25, -0.25, -0.25, 0.75, -0.25, -0.25, -0.25, 0.75, 0.0]
+    """
+    fine = fine.copy()
+    for j in np.flatnonzero(record.last_part).tolist():
+        beside_mean = _later(record.last_part[j], parts) - record.last_part[j]
+        fine[:-1, j] += np.outer(record.changes[:-1, j], beside_mean).ravel()
+    return fine
+
+
+def _later(last_part: float, parts: int) -> FloatArray:
+    """How much of a change has come in each part, (parts,), where it comes for the last part.
+
+    Of the part in which it comes its share; those beside it such that it has come in the mean when
+    it has.
+    """
+    first = parts * (1.0 - last_part)
+    later: FloatArray = np.clip(np.arange(1.0, parts + 1.0) - first, 0.0, 1.0)
+    place = min(int(first), parts - 1)
+    before, after = max(place - 1, 0), min(place + 1, parts - 1)
+    missed = 0.5 * later[place] * (1.0 - later[place]) / (after - before)
+    later[before] -= missed
+    later[after] += missed
+    return later
+
+
 def with_bends(model: ProcessModel, record: Dataset, splines: Sequence[int]) -> FloatArray:
     """Inputs of a record, and behind them a and b of each of the splines, by their places.
 

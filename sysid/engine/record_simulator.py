@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.engine.bends import in_parts, splines_of, with_bends
+from sysid.engine.bends import in_parts, splines_of, with_bends, with_changes
 from sysid.engine.compiler import Filter, Kernels, explained_errors, kernels
 from sysid.engine.compiler import tangents as compiled_tangents
 from sysid.engine.filter_kernel import FilterKernel
@@ -47,7 +47,9 @@ _PILOT_LEAST = 32  # samples
 _LADDER = np.unique(np.round(2.0 ** np.arange(0, 20.01, 0.5)).astype(np.int64))
 _ALL_LANES = np.arange(LANES)
 _UNTRACED = np.empty((0, 0)), np.empty((0, 0))
-_PARTS = 8  # of a sample, in which a free run tells what averaged outputs are but no parabola
+# Of a sample, in which a free run tells what averaged outputs are but no parabola, and in which
+# inputs change.
+_PARTS = 8
 _AT_ONCE = 1024  # samples of which that many are kept
 _BEFORE = 1e-6  # samples before its first by which a window may begin for the arithmetic's sake
 
@@ -109,19 +111,30 @@ class RecordSimulator:
         self._steps_of: dict[bytes, int] = {}
         self._means_of: dict[tuple[tuple[int, ...], bool], _Means] = {}
         self._inputs_of: dict[tuple[int, ...], FloatArray] = {}
-        if self.averaged:
-            if self.scale is not None:
-                # What a window saw before the record is not known.
-                early = np.arange(len(windows))[:, None] + windows[..., 0] < -_BEFORE
-                self._weights = np.where(early, 0.0, self._weights)
-            self._integrating = kernels(with_integrals(model, self.averaged))
+        if self.averaged and self.scale is not None:
+            # What a window saw before the record is not known.
+            early = np.arange(len(windows))[:, None] + windows[..., 0] < -_BEFORE
+            self._weights = np.where(early, 0.0, self._weights)
+        averaging = with_integrals(model, self.averaged) if self.averaged else model
+        self._integrating = kernels(averaging)
+        self._parts = _PARTS if record.last_part.any() else 1
+        self._driving, self._compared = self._inputs, (self._measured, self._weights)
+        if self._parts > 1:
+            self._driving = with_changes(in_parts(model, self._inputs, _PARTS), record, _PARTS)
+            self._compared = self._finely(self._measured), self._finely(self._weights)
         # Measured outputs and weights that leave outputs, and integrals of them, as they are.
-        shape = len(outputs), outputs.shape[1] + len(self.averaged)
+        shape = len(self._driving), outputs.shape[1] + len(self.averaged)
         self._unmeasured = np.zeros(shape), np.ones(shape)
         self._weight = self._weights.max(axis=0)
         # Where an input is largest is where a model driven through it is fastest.
         peaks = np.argmax(np.abs(record.inputs), axis=0) if record.inputs.shape[1] else []
         self._extremes = record.inputs[np.unique(np.array([0, *peaks], dtype=np.int64))]
+
+    def _finely(self, table: FloatArray) -> FloatArray:
+        """A table of the samples, zero at the parts between them."""
+        fine = np.zeros((len(self._driving), table.shape[1]))
+        fine[:: self._parts] = table
+        return fine
 
     def population(self, parameters: FloatArray, starts: FloatArray | None = None) -> Population:
         """Simulate each with the steps that it needs, (n, n_parameters).
@@ -235,6 +248,8 @@ class RecordSimulator:
             inputs = with_bends(model, record, kernel.splines)
             self._inputs_of[tuple(kernel.splines)] = inputs
         measured = self._after_the_last(cut, parameters, starts, lanes, n_steps)
+        if self._parts > 1:
+            measured -= self._beyond_means(parameters, starts, lanes, n_steps)
         if settings.exact:
             measured -= self.beyond_parabolas(parameters, starts, lanes, n_steps)
         with explained_errors(model):
@@ -318,14 +333,16 @@ class RecordSimulator:
         at, moves = np.split(starts, 2, axis=1)
         starts = np.hstack([at, nothing, moves, nothing])
         padded = np.arange(LANES) % n
-        kept = np.empty((self.record.n_samples, q + len(self.averaged), LANES))
+        fine = np.empty((len(self._driving), q + len(self.averaged), LANES))
         work = work_area(kernel.work_rows * LANES)
         with explained_errors(model):
             tangents.simulate(
-                work, work.reshape(-1, LANES), kernel.tables, self._inputs, *self._unmeasured,
+                work, work.reshape(-1, LANES), kernel.tables, self._driving, *self._unmeasured,
                 np.ascontiguousarray(starts[padded].T), np.ascontiguousarray(parameters[padded].T),
-                self.record.dt, n_steps, np.empty((2 * kernel.n_outputs, LANES)), kept,
+                self.record.dt / self._parts, -(-n_steps // self._parts),
+                np.empty((2 * kernel.n_outputs, LANES)), fine,
             )  # fmt: skip
+        kept = np.ascontiguousarray(fine[:: self._parts])
         for i, j in enumerate(self.averaged):
             kept[:, j] = average(kept[:, j], kept[:, q + i] / self.record.dt, self._windows[j])
         return kept[:, :q, :n]
@@ -347,13 +364,19 @@ class RecordSimulator:
         """
         if self.averaged:
             return self._averaged_block(parameters, starts, lanes, n_steps, n_samples)
-        residuals = np.empty((n_samples if keep else 0, self._measured.shape[1], LANES))
-        run = tuple(part[:n_samples] for part in (self._inputs, self._measured, self._weights))
-        start, dt = self._initial(starts, lanes), self.record.dt
+        rows = self._rows(n_samples)
+        residuals = np.empty((rows if keep else 0, self._measured.shape[1], LANES))
+        run = tuple(part[:rows] for part in (self._driving, *self._compared))
+        start, dt = self._initial(starts, lanes), self.record.dt / self._parts
+        steps = -(-n_steps // self._parts)
         sums, estimates, _ = self._run(
-            self.kernels, parameters, start, lanes, dt, n_steps, run, residuals
+            self.kernels, parameters, start, lanes, dt, steps, run, residuals
         )
-        return sums, estimates, residuals
+        return sums, estimates, residuals[:: self._parts]
+
+    def _rows(self, n_samples: int) -> int:
+        """Rows of what drives so many samples, parts between them included."""
+        return (n_samples - 1) * self._parts + 1
 
     def _means(self, averaged: Sequence[int], corrects: bool) -> _Means:
         """Weights (n_samples, n_outputs, 2, 4) as of ``weights_of_sums`` for a filter.
@@ -404,6 +427,24 @@ class RecordSimulator:
                     measured[:, j] += last - average(output, integral, self._windows[j])
         return measured
 
+    def _beyond_means(
+        self, parameters: FloatArray, starts: FloatArray | None, lanes: IntArray, n_steps: int
+    ) -> FloatArray:
+        """What inputs that change between samples do beside their means, by free runs.
+
+        (n_samples, n_outputs, LANES).
+        """
+        runs = []
+        for by_means in (False, True):
+            outputs, integrals, _ = self._integrated(
+                parameters, starts, lanes, n_steps, self.record.n_samples, by_means=by_means
+            )
+            for j, integral in zip(self.averaged, integrals, strict=True):
+                outputs[:, j] = average(outputs[:, j], integral, self._windows[j])
+            runs.append(outputs)
+        beyond: FloatArray = runs[0] - runs[1]
+        return beyond
+
     def beyond_parabolas(
         self,
         parameters: FloatArray,
@@ -420,7 +461,10 @@ class RecordSimulator:
             return beyond
         if self._in_parts is None:
             ends = {j: ends_of(self._windows[j]) for j in self.averaged}
-            self._in_parts = in_parts(self.kernels.model, self._inputs, _PARTS), ends
+            inputs = self._driving
+            if self._parts == 1:
+                inputs = in_parts(self.kernels.model, self._inputs, _PARTS)
+            self._in_parts = inputs, ends
         (inputs, ends), dt, steps = self._in_parts, self.record.dt / _PARTS, -(-n_steps // _PARTS)
         state = self._integrating_start(starts, lanes)
         q = self._measured.shape[1]
@@ -445,19 +489,24 @@ class RecordSimulator:
         lanes: IntArray,
         n_steps: int,
         n_samples: int,
+        *,
+        by_means: bool = False,
     ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
         """Outputs (n_samples, n_outputs, LANES) at their instants, and integrals of the averaged.
 
         Each (n_samples, LANES), over the sample time. With them the error estimates of the
-        outputs, (n, n_outputs).
+        outputs, (n, n_outputs). by_means: of inputs that change between samples.
         """
-        q, more = self._measured.shape[1], len(self.averaged)
-        kept = np.empty((n_samples, q + more, LANES))
+        parts = 1 if by_means else self._parts
+        inputs = self._inputs if by_means else self._driving
+        q, more, rows = self._measured.shape[1], len(self.averaged), (n_samples - 1) * parts + 1
+        fine = np.empty((rows, q + more, LANES))
         start, dt = self._integrating_start(starts, lanes), self.record.dt
-        run = tuple(part[:n_samples] for part in (self._inputs, *self._unmeasured))
+        run = tuple(part[:rows] for part in (inputs, *self._unmeasured))
         _, estimates, _ = self._run(
-            self._integrating, parameters, start, lanes, dt, n_steps, run, kept
+            self._integrating, parameters, start, lanes, dt / parts, -(-n_steps // parts), run, fine
         )
+        kept = fine[::parts]
         integrals = [kept[:, q + i] / dt for i in range(more)]
         return kept[:, :q], integrals, estimates[:, :q]
 

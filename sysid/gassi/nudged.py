@@ -107,6 +107,8 @@ def _with_measured(
         input_zero=np.append(record.input_zero, none[0]),
         input_noise=np.append(record.input_noise, none[0]),
         between=np.hstack([record.between, none]) if record.between.size else record.between,
+        changes=np.hstack([record.changes, none]) if record.changes.size else record.changes,
+        last_part=np.append(record.last_part, none[0]),
     )
 
 

@@ -27,11 +27,13 @@ class Dataset:
     both 0 where it was sampled at its instant. Simulated outputs are averaged alike. jitter:
     (n_samples, n_outputs), standard deviation of when each window was [s]. between: (n_samples,
     n_inputs), by how much the mean of an interpolated input up to the next sample differs from that
-    of a straight line, for which filters bend it. Default none. begin: instant of the first row as
-    whoever made the record counts time [s]. cut: whether it was cut from a longer record amid its
-    motion, so that states whose first sample is a mean over the time before start elsewhere. log:
-    of a part of a longer record the number of that, whose channels' zeros all of its parts share;
-    None of a whole one.
+    of a straight line, for which filters bend it. changes: (n_samples, n_inputs), by how much a
+    held input changes before the next sample; last_part: (n_inputs,), part of the time up to that
+    for which it is the later value; such inputs are means over that time. Default none. begin:
+    instant of the first row as whoever made the record counts time [s]. cut: whether it was cut
+    from a longer record amid its motion, so that states whose first sample is a mean over the time
+    before start elsewhere. log: of a part of a longer record the number of that, whose channels'
+    zeros all of its parts share; None of a whole one.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -52,6 +54,8 @@ class Dataset:
     windows: FloatArray = field(default_factory=lambda: np.zeros(0))
     jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
     between: FloatArray = field(default_factory=lambda: np.zeros(0))
+    changes: FloatArray = field(default_factory=lambda: np.zeros(0))
+    last_part: FloatArray = field(default_factory=lambda: np.zeros(0))
     begin: float = 0.0
     cut: bool = False
     log: int | None = None
@@ -77,11 +81,20 @@ class Dataset:
         for name in ("input_zero", "output_zero", "input_noise", "output_noise"):
             object.__setattr__(self, name, self._deviations(name))
         self._check_windows()
-        if self.between.size and self.between.shape != self.inputs.shape:
+        for name in ("between", "changes"):
+            table = getattr(self, name)
+            if table.size and table.shape != self.inputs.shape:
+                raise ModelError(
+                    f"{self.name}: {name} has shape {table.shape}; give a number for each sample "
+                    f"and input: {self.inputs.shape}"
+                )
+        parts = self.last_part if self.changes.size else np.zeros(self.inputs.shape[1])
+        if parts.shape != self.inputs.shape[1:] or not np.all((parts >= 0.0) & (parts < 1.0)):
             raise ModelError(
-                f"{self.name}: between has shape {self.between.shape}; give a number for each "
-                f"sample and input: {self.inputs.shape}"
+                f"{self.name}: last_part must hold a number from 0 to 1 for each input that has "
+                f"changes: {self.inputs.shape[1:]}"
             )
+        object.__setattr__(self, "last_part", parts)
 
     def _check_windows(self) -> None:
         """Raise ModelError for windows that are none of these outputs'."""
@@ -158,6 +171,7 @@ class Dataset:
             windows=self.windows[rows],
             jitter=self.jitter[rows],
             between=self.between[rows],
+            changes=self.changes[rows],
             name=name,
             begin=self.begin + begin * self.dt,
         )

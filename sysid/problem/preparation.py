@@ -96,7 +96,7 @@ def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) ->
         problem = f"{record.name} is {record.n_samples * record.dt:g} s long"
         raise PreparationError(("delay", name), f"{problem}; the delay must be far shorter")
     rows, n = np.arange(first, last + 1), len(model.inputs)
-    # A held input is what it is on the mean until the next sample.
+    # A held input is what it is on the mean until the next sample, and changes on the way there.
     held = [signal.hold == "zoh" for signal in model.inputs] + [False] * len(model.outputs)
     channels = np.column_stack((record.inputs, record.outputs)).T
     moved = np.column_stack(
@@ -107,8 +107,15 @@ def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) ->
         places = np.round(rows[:, None] + shifts[n:]).astype(np.int64)
         windows = np.take_along_axis(windows, places[..., None], axis=0)
         jitter = np.take_along_axis(jitter, places, axis=0)
+    changes, last_part = _changes(record.inputs, rows, np.where(held[:n], shifts[:n], 0.0))
     made = replace(
-        record, inputs=moved[:, :n], outputs=moved[:, n:], windows=windows, jitter=jitter
+        record,
+        inputs=moved[:, :n],
+        outputs=moved[:, n:],
+        windows=windows,
+        jitter=jitter,
+        changes=changes,
+        last_part=last_part,
     )
     given = {name: late for name, late in preparation.delay.items() if name in names and late}
     words = [
@@ -117,6 +124,20 @@ def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) ->
     ]
     steps = (*before.steps, f"moved: {', '.join(words)}")
     return Prepared(made, before.start + first * record.dt, steps)
+
+
+def _changes(
+    inputs: FloatArray, rows: IntArray, shifts: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What held inputs (n, n_inputs) do between rows, so many samples later, as of ``Dataset``."""
+    whole = np.floor(shifts)
+    part = shifts - whole
+    if not part.any():
+        return np.zeros(0), np.zeros(0)
+    first = rows[:, None] + whole.astype(np.int64)
+    after = np.minimum(first + 1, len(inputs) - 1)
+    before, later = (np.take_along_axis(inputs, at, axis=0) for at in (first, after))
+    return later - before, part
 
 
 def at_places(values: FloatArray, places: FloatArray, held: bool) -> FloatArray:
@@ -236,6 +257,7 @@ def _decimated(model: ProcessModel, before: Prepared, preparation: Preparation) 
         jitter=record.jitter[kept] * rest,
         input_noise=record.input_noise * np.where(held, rest_of_held, rest),
         output_noise=record.output_noise * rest,
+        changes=np.zeros(0),
     )
     step = (
         f"low-pass of {len(taps)} taps, and one of {factor} samples: {record.n_samples} of "
