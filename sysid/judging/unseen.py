@@ -71,7 +71,7 @@ def _delays(run: DisturbedRun, channels: Sequence[Suspect]) -> Iterator[Possibil
         if late is not None:
             suspect = Suspect("delay", name, "s", late(-usual) / usual, of_input=True)
             words = f"that {name} acts up to {{size}} later than it is logged"
-            cure = f"Logs sampled faster tell, or a scope that shows {name}."
+            cure = f"A faster log tells, or a scope that shows {name}: 'delay' takes it out then."
             yield Possibility(suspect, usual, words, 1.0, "s", cure)
 
 
