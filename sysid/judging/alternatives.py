@@ -129,7 +129,7 @@ def moved_by_noise(
         deviations = {e.name: e.deviation for e in fitted.uncertainty(noisy).determined()}
     except ModelError:
         return replace(finding, amplitude=size, moves=())
-    estimates = list(_shared(uncertainty, fitted.parameters_))
+    estimates = list(shared(uncertainty, fitted.parameters_))
     changes = [e.at(fitted.parameters_) - e.value for e in estimates]
     pairs = [(deviations.get(e.name), e.deviation) for e in estimates]
     wider = max((with_it / alone for with_it, alone in pairs if with_it and alone), default=1.0)
@@ -188,7 +188,7 @@ def _moved(
 ) -> dict[str, tuple[float, float, str]]:
     """Determined quantities that the variant has outside of their intervals, the farthest first."""
     moved = []
-    for estimate in _shared(uncertainty, parameters):
+    for estimate in shared(uncertainty, parameters):
         if estimate.deviation and estimate.excludes(parameters):
             value = estimate.at(parameters)
             far = abs(value - estimate.value) / estimate.deviation
@@ -196,7 +196,7 @@ def _moved(
     return {name: values for _, name, values in sorted(moved, key=lambda m: -m[0])}
 
 
-def _shared(uncertainty: Uncertainty, parameters: dict[str, float]) -> Iterator[Estimate]:
+def shared(uncertainty: Uncertainty, parameters: dict[str, float]) -> Iterator[Estimate]:
     """Determined quantities of parameters that another fit has as well."""
     for estimate in uncertainty.determined():
         combination = estimate.combination

@@ -17,6 +17,7 @@ from sysid.judging.exchanges import exchanged_channels
 from sysid.judging.expected_errors import expected_errors
 from sysid.judging.findings import Finding
 from sysid.judging.lags import lag_faults
+from sysid.judging.latencies import with_latencies
 from sysid.judging.score_tests import ScoreTests, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
@@ -152,6 +153,7 @@ def suspected(
         moved_by_noise(f, estimator, uncertainty, training) if f.kind == "noise" else f
         for f in findings
     )
+    findings = with_latencies(findings, estimator, uncertainty, training)
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
     return Suspicion(findings, fitted, unseen)
 

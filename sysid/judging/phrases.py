@@ -7,7 +7,6 @@ from collections.abc import Sequence
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # Not before a power, which would raise the prefix too: 1 mm^2 is not 1e-3 m^2.
 _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
-_FAR = 1e3  # times a value, from where the multiple of its unit is the other one's
 
 
 def sized(value: float, unit: str, digits: int = 3) -> str:
@@ -23,13 +22,13 @@ def sized(value: float, unit: str, digits: int = 3) -> str:
 def change(old: float, new: float, unit: str) -> str:
     """Two values, to as many digits as tell them apart.
 
-    >>> change(0.0030012, 0.0030104, "H"), change(1.2, 80.0, "1")
-    ('3.001 -> 3.01 mH', '1.2 -> 80')
+    >>> change(0.0030012, 0.0030104, "H"), change(4.5e-4, 1.1e-3, "H"), change(1.2, 80.0, "1")
+    ('3.001 -> 3.01 mH', '0.45 -> 1.1 mH', '1.2 -> 80')
     """
     size, difference = max(abs(old), abs(new)), abs(new - old)
     apart = math.ceil(math.log10(size / difference)) + 1 if difference else 3
     digits = min(max(apart, 3), 6)
-    factor, multiple = _multiple(old if _FAR * abs(old) > abs(new) else new, unit)
+    factor, multiple = _multiple(size, unit)
     before, after = (_number(factor * value, digits) for value in (old, new))
     return f"{before} -> {after} {multiple}".rstrip()
 

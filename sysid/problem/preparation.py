@@ -135,9 +135,30 @@ def _changes(
     if not part.any():
         return np.zeros(0), np.zeros(0)
     first = rows[:, None] + whole.astype(np.int64)
-    after = np.minimum(first + 1, len(inputs) - 1)
-    before, later = (np.take_along_axis(inputs, at, axis=0) for at in (first, after))
+    before, later = (
+        np.take_along_axis(inputs, np.clip(at, 0, len(inputs) - 1), axis=0)
+        for at in (first, first + 1)
+    )
     return later - before, part
+
+
+def acting_later(record: Dataset, places: Sequence[int], time: float) -> Dataset:
+    """A record whose held inputs at some places act so much later [s] than it says.
+
+    Before its first sample, and after its last, as at that.
+
+    >>> record = Dataset(np.array([0.0, 1.0, 3.0]), np.zeros(3), 0.1)
+    >>> acting_later(record, [0], 0.05).inputs[:, 0].tolist()
+    [0.0, 0.5, 2.0]
+    """
+    rows, shifts = np.arange(record.n_samples), np.zeros(record.inputs.shape[1])
+    shifts[list(places)] = -time / record.dt
+    inputs = record.inputs.copy()
+    for i in places:
+        at = np.clip(rows + shifts[i], 0.0, record.n_samples - 1.0)
+        inputs[:, i] = at_places(record.inputs[:, i], at, held=True)
+    changes, last_part = _changes(record.inputs, rows, shifts)
+    return replace(record, inputs=inputs, changes=changes, last_part=last_part)
 
 
 def at_places(values: FloatArray, places: FloatArray, held: bool) -> FloatArray:

@@ -1,0 +1,158 @@
+"""Held inputs that act later than they are logged, as behind a driver, or earlier.
+
+A fit hides most of it: 0.3 ms at 1 kHz make a motor's inductance a third larger, and what is left
+looks like a speed that is logged late, or a sensor of it that sees the current. Slopes at that
+minimum tell no more. So such inputs are moved, and all is fitted anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import chdtrc
+
+from sysid.arrays import FloatArray
+from sysid.fitting.objective import Objective
+from sysid.fitting.refinement import refine
+from sysid.judging.alternatives import shared
+from sysid.judging.findings import Finding, moves_of
+from sysid.judging.score_tests import missing_physics
+from sysid.problem.data import Dataset
+from sysid.problem.model import ModelError, ProcessModel
+from sysid.problem.preparation import acting_later
+from sysid.uncertainty import Uncertainty
+
+if TYPE_CHECKING:
+    from sysid.gassi import GASSI
+
+_ALIKE = ("delay", "filter", "mean", "lag", "crosstalk")  # kinds of findings that it may be
+_STEP, _FARTHEST = 0.25, 2.0  # samples, between times that are tried in turn, and the last of them
+_CLOSER = 3  # times more that are tried, each where those before it say
+_CUT = 3  # samples at the ends of records that are left out, more than any of these times
+_LEAST = 50  # samples of a record, to lose these
+_SURE = 30.0  # of twice the logarithm of a likelihood ratio, below which it may be chance
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A fit with inputs that act so much later [s]; rms: (n_outputs,), the outputs' errors."""
+
+    time: float
+    objective: Objective
+    chromosome: FloatArray
+    rms: FloatArray
+
+    @property
+    def deviance(self) -> float:
+        """Minus twice the logarithm of its likelihood."""
+        with np.errstate(divide="ignore"):
+            return 2.0 * float(self.objective.counts @ np.log(self.rms))
+
+
+def with_latencies(
+    findings: tuple[Finding, ...],
+    estimator: GASSI,
+    uncertainty: Uncertainty,
+    training: Sequence[Dataset],
+) -> tuple[Finding, ...]:
+    """Findings, or in their place the time by which held inputs act later, where it is all.
+
+    Of each input alone, then of all by the same: refits tell how late, and it is taken for what is
+    missing if nothing that counts is found where they end.
+    """
+    surest = next((finding for finding in findings if finding.counts), None)
+    shortest = min(record.n_samples for record in training)
+    if surest is None or surest.kind not in _ALIKE or shortest < _LEAST:
+        return findings
+    model, dt = estimator.simulator().model, training[0].dt
+    held = _exact_and_held(model, training)
+    together = [held] if len(held) > 1 else []
+    for places in [*([i] for i in held), *together]:
+        pair = _later(estimator, training, places, dt)
+        if pair is not None and not _lacks(pair[1], uncertainty):
+            names = [model.input_names[i] for i in places]
+            return tuple(_finding(*pair, name, uncertainty) for name in names)
+    return findings
+
+
+def _finding(here: _Moved, late: _Moved, name: str, uncertainty: Uncertainty) -> Finding:
+    """An input that is logged early; here: the fit as it is logged."""
+    names = late.objective.space.names
+    parameters = dict(zip(names, late.chromosome.tolist(), strict=True))
+    # Where records start has moved as well, and is nobody's parameter.
+    of_model = {*late.objective.simulator.model.parameter_names}
+    estimates = [e for e in shared(uncertainty, parameters) if e.combination or e.name in of_model]
+    moves = moves_of(estimates, [e.at(parameters) - e.value for e in estimates])
+    chance = float(chdtrc(1, here.deviance - late.deviance))
+    share = 1.0 - float(np.mean((late.rms / here.rms) ** 2))
+    return Finding("delay", name, "s", -late.time, chance, share, moves, of_input=True)
+
+
+def _exact_and_held(model: ProcessModel, training: Sequence[Dataset]) -> list[int]:
+    """Places of the inputs that are held, and logged without noise."""
+    noisy = np.any([record.input_noise for record in training], axis=0)
+    moving = np.any([np.ptp(record.inputs, axis=0) > 0.0 for record in training], axis=0)
+    held = np.array([given.hold == "zoh" for given in model.inputs], dtype=bool)
+    return np.flatnonzero(held & moving & ~noisy).tolist()
+
+
+def _later(
+    estimator: GASSI, training: Sequence[Dataset], places: Sequence[int], dt: float
+) -> tuple[_Moved, _Moved] | None:
+    """A fit anew, and the likeliest with inputs that act later, or earlier.
+
+    None where chance explains that.
+    """
+
+    def moved(samples: float, begin: FloatArray) -> _Moved:
+        # What acted before a record, and may yet act at its begin, is not known.
+        late = (acting_later(record, places, samples * dt) for record in training)
+        records = [r.part(_CUT, r.n_samples - _CUT, r.name) for r in late]
+        of = estimator.final_objective if estimator.averaged_inputs_ else estimator.final_free_run
+        objective = of(records)
+        end = refine(objective, begin)
+        return _Moved(samples * dt, objective, end.chromosome, end.rms)
+
+    try:
+        here = moved(0.0, estimator.final_chromosome_)
+        tried = [moved(-_STEP, here.chromosome), here, moved(_STEP, here.chromosome)]
+        while (best := min(tried, key=_deviance)) in (tried[0], tried[-1]):
+            samples = best.time / dt + math.copysign(_STEP, best.time)
+            if abs(samples) > _FARTHEST:
+                break
+            tried = sorted([*tried, moved(samples, best.chromosome)], key=_time)
+        for _ in range(_CLOSER):
+            tried = sorted([*tried, moved(_vertex(tried) / dt, best.chromosome)], key=_time)
+            best = min(tried, key=_deviance)
+    except ModelError:  # a simulation that fails there
+        return None
+    return (here, best) if here.deviance - best.deviance > _SURE else None
+
+
+_deviance, _time = attrgetter("deviance"), attrgetter("time")
+
+
+def _vertex(tried: Sequence[_Moved]) -> float:
+    """Where the parabola through the likeliest fit and those beside it is lowest, within these."""
+    best = min(range(len(tried)), key=lambda k: tried[k].deviance)
+    place = min(max(best, 1), len(tried) - 2)
+    three = tried[place - 1 : place + 2]
+    times = [fit.time for fit in three]
+    square, slope, _ = np.polyfit(times, [fit.deviance for fit in three], 2)
+    if square <= 0.0:
+        return times[1]
+    return min(max(float(-slope / (2.0 * square)), times[0]), times[2])
+
+
+def _lacks(late: _Moved, uncertainty: Uncertainty) -> bool:
+    """Whether something that counts is found where a fit ended."""
+    try:
+        findings = missing_physics(late.objective, late.chromosome, uncertainty)
+    except ModelError:
+        return True
+    return any(finding.counts for finding in findings)
