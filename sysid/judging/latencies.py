@@ -32,13 +32,14 @@ if TYPE_CHECKING:
 
 _ALIKE = ("delay", "filter", "mean", "lag", "crosstalk")  # kinds of findings that it may be
 _STEP, _FARTHEST = 0.25, 2.0  # samples, between times that are tried in turn, and the last of them
-_CLOSER = 3  # times more that are tried, each where those before it say
+# Times more that are tried, each where those before it say, and samples by which they differ.
+_CLOSER, _SAME = 3, 2e-3
 _CUT = 3  # samples at the ends of records that are left out, more than any of these times
-_LEAST = 50  # samples of a record, to lose these
+_LEAST, _MOST = 50, 20_000  # samples of a record, to lose these, and of all to be fitted so often
 _SURE = 30.0  # of twice the logarithm of a likelihood ratio, below which it may be chance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Moved:
     """A fit with inputs that act so much later [s]; rms: (n_outputs,), the outputs' errors."""
 
@@ -66,8 +67,7 @@ def with_latencies(
     missing if nothing that counts is found where they end.
     """
     surest = next((finding for finding in findings if finding.counts), None)
-    shortest = min(record.n_samples for record in training)
-    if surest is None or surest.kind not in _ALIKE or shortest < _LEAST:
+    if surest is None or surest.kind not in _ALIKE or not _can_be_moved(training):
         return findings
     model, dt = estimator.simulator().model, training[0].dt
     held = _exact_and_held(model, training)
@@ -91,6 +91,13 @@ def _finding(here: _Moved, late: _Moved, name: str, uncertainty: Uncertainty) ->
     chance = float(chdtrc(1, here.deviance - late.deviance))
     share = 1.0 - float(np.mean((late.rms / here.rms) ** 2))
     return Finding("delay", name, "s", -late.time, chance, share, moves, of_input=True)
+
+
+def _can_be_moved(training: Sequence[Dataset]) -> bool:
+    """Whether records are long enough, not so long that fits take minutes, and as logged."""
+    lengths = [record.n_samples for record in training]
+    prepared = any(record.last_part.any() for record in training)
+    return min(lengths) >= _LEAST and sum(lengths) <= _MOST and not prepared
 
 
 def _exact_and_held(model: ProcessModel, training: Sequence[Dataset]) -> list[int]:
@@ -127,7 +134,10 @@ def _later(
                 break
             tried = sorted([*tried, moved(samples, best.chromosome)], key=_time)
         for _ in range(_CLOSER):
-            tried = sorted([*tried, moved(_vertex(tried) / dt, best.chromosome)], key=_time)
+            time = _vertex(tried)
+            if any(abs(time - fit.time) < _SAME * dt for fit in tried):
+                break
+            tried = sorted([*tried, moved(time / dt, best.chromosome)], key=_time)
             best = min(tried, key=_deviance)
     except ModelError:  # a simulation that fails there
         return None
@@ -141,12 +151,12 @@ def _vertex(tried: Sequence[_Moved]) -> float:
     """Where the parabola through the likeliest fit and those beside it is lowest, within these."""
     best = min(range(len(tried)), key=lambda k: tried[k].deviance)
     place = min(max(best, 1), len(tried) - 2)
-    three = tried[place - 1 : place + 2]
-    times = [fit.time for fit in three]
-    square, slope, _ = np.polyfit(times, [fit.deviance for fit in three], 2)
-    if square <= 0.0:
-        return times[1]
-    return min(max(float(-slope / (2.0 * square)), times[0]), times[2])
+    (t0, d0), (t1, d1), (t2, d2) = ((f.time, f.deviance) for f in tried[place - 1 : place + 2])
+    slope = (d1 - d0) / (t1 - t0)
+    curvature = ((d2 - d1) / (t2 - t1) - slope) / (t2 - t0)
+    if not curvature > 0.0:
+        return t1
+    return min(max(0.5 * (t0 + t1 - slope / curvature), t0), t2)
 
 
 def _lacks(late: _Moved, uncertainty: Uncertainty) -> bool:
