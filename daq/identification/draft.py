@@ -25,11 +25,11 @@ from sysid.threads import one_thread
 
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
-    from sysid.judging.findings import Finding
+    from sysid.judging.findings import Missing
     from sysid.judging.score_tests import ScoreTests
     from sysid.uncertainty import Uncertainty
 
-    Missing = Callable[[Uncertainty], tuple[Finding, ...]]
+    Tests = Callable[[Uncertainty], Missing]
 
 
 class Draft:
@@ -62,17 +62,15 @@ class Draft:
         if self._data is not None and len(self._linear) == 1:
             self._linear.append(self.second.call(of_regressors, self._data))
 
-    def score_tests(
-        self, problem: Problem, estimator: GASSI, training: Sequence[Dataset]
-    ) -> Missing:
-        """Have tests of what the model may lack begun where a fit ended; what gives the findings.
+    def score_tests(self, problem: Problem, estimator: GASSI, training: Sequence[Dataset]) -> Tests:
+        """Have tests of what the model may lack begun where a fit ended; what gives their results.
 
         Where the other process has something left to do, or none are wanted, they are left to this.
         """
         from sysid.judging.examination import score_tests_of
 
-        def here(uncertainty: Uncertainty) -> tuple[Finding, ...]:
-            return score_tests_of(estimator, training).findings(uncertainty)
+        def here(uncertainty: Uncertainty) -> Missing:
+            return score_tests_of(estimator, training).missing(uncertainty)
 
         begun = (self._compiled, *self._linear)
         if not all(job is not None and job.is_answered for job in begun):
@@ -80,14 +78,14 @@ class Draft:
         fit = pickle.dumps(problem.request), _without_models((estimator, list(training)))
         tests = self.second.call(_begun, *fit)
 
-        def findings(uncertainty: Uncertainty) -> tuple[Finding, ...]:
+        def missing(uncertainty: Uncertainty) -> Missing:
             if not tests.result():
                 return here(uncertainty)
-            job = self.second.call(_findings, *fit, uncertainty)
+            job = self.second.call(_missing, *fit, uncertainty)
             self._go_on()
             return job.result()
 
-        return findings
+        return missing
 
 
 def _compiled_ahead(request: bytes, record: Dataset) -> None:
@@ -111,8 +109,8 @@ def _begun(request: bytes, fit: bytes) -> bool:
 
 
 @one_thread()
-def _findings(request: bytes, fit: bytes, uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    return _score_tests(request, fit).findings(uncertainty)
+def _missing(request: bytes, fit: bytes, uncertainty: Uncertainty) -> Missing:
+    return _score_tests(request, fit).missing(uncertainty)
 
 
 @lru_cache(maxsize=1)

@@ -37,7 +37,7 @@ from sysid.problem.faults import DataFault, Part, after_mending, data_faults
 if TYPE_CHECKING:
     import pandas as pd
 
-    from daq.identification.draft import Draft, Missing
+    from daq.identification.draft import Draft, Tests
     from daq.identification.earlier_fit import EarlierFit
     from sysid.gassi import GASSI
     from sysid.gassi import Progress as SearchProgress
@@ -373,7 +373,7 @@ def assemble(
 
 
 def examined(
-    result: Identification, logs: Split, watch: Watch, missing: Missing | None = None
+    result: Identification, logs: Split, watch: Watch, missing: Tests | None = None
 ) -> Identification:
     """With what the model may lack tested, and the surest variant fitted.
 

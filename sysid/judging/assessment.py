@@ -18,7 +18,7 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.alternatives import Alternative
 from sysid.judging.evidence import independent_samples
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
-from sysid.judging.findings import MOVED, Finding, description
+from sysid.judging.findings import MOVED, Finding, Unseen, description
 from sysid.judging.phrases import change, sized
 from sysid.judging.residual_patterns import errors_alone, errors_by_speed, shared_errors
 from sysid.judging.residual_tests import ResidualTest, residual_test
@@ -183,7 +183,7 @@ def judge(
     findings: Sequence[Finding] | None = None,
     alternative: Alternative | None = None,
     faults: Sequence[DataFault] = (),
-    unseen: Sequence[Finding] = (),
+    unseen: Sequence[Unseen] = (),
 ) -> Verdict:
     """The verdict on an identification.
 
@@ -234,7 +234,7 @@ def judge(
     moving = f"Found, but moving no parameter by {MOVED:g} standard deviations: {slight}."
     notes = [moving] if slight else []
     notes += [fault.sentence for fault in spoilt if fault.part == "validation"]
-    notes += [_not_seen(finding) for finding in unseen]
+    notes += map(_not_seen, unseen)
     return Verdict(predicted, parameters, (*notes, *_untested(model, judged, uncertainty)))
 
 
@@ -649,9 +649,9 @@ def _moving(finding: Finding) -> str:
     return f"{says}{text} ({chance})" + (f"; {effect}." if not far else ".")
 
 
-def _not_seen(finding: Finding) -> str:
+def _not_seen(unseen: Unseen) -> str:
     """Note: what would not show in the data, and where it would move parameters."""
-    moved = [move for move in finding.moves if abs(move.deviations) > MOVED][:3]
+    moved = [move for move in unseen.moves if abs(move.deviations) > MOVED][:3]
     by = ", ".join(
         f"{m.quantity.name} by {abs(100.0 * m.change / m.quantity.value):.2g} %"
         if m.quantity.value
@@ -661,8 +661,8 @@ def _not_seen(finding: Finding) -> str:
     interval = "its interval" if len(moved) == 1 else "their intervals"
     taken = moved[0].quantity.name if len(moved) == 1 else "these"
     return (
-        f"These data would not show {description(finding)}. That would move {by}, far beyond "
-        f"{interval}, for the fit takes it for a part of {taken}. {finding.cure}"
+        f"These data would not show {unseen.text}. That would move {by}, far beyond "
+        f"{interval}, for the fit takes it for a part of {taken}. {unseen.cure}"
     )
 
 

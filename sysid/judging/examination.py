@@ -15,7 +15,7 @@ from sysid.judging.alternatives import Alternative, best_alternative, moved_by_n
 from sysid.judging.assessment import RecordResult, Verdict, examine, judge
 from sysid.judging.exchanges import exchanged_channels
 from sysid.judging.expected_errors import expected_errors
-from sysid.judging.findings import Finding
+from sysid.judging.findings import Finding, Missing, Unseen
 from sysid.judging.lags import lag_faults
 from sysid.judging.latencies import with_latencies
 from sysid.judging.score_tests import ScoreTests, missing_physics
@@ -38,7 +38,7 @@ class Suspicion:
 
     findings: tuple[Finding, ...]
     alternative: Alternative | None
-    unseen: tuple[Finding, ...] = ()
+    unseen: tuple[Unseen, ...] = ()
 
 
 def verdict_of(
@@ -119,15 +119,15 @@ def suspected(
     uncertainty: Uncertainty | None,
     training: Sequence[Dataset],
     validation: Sequence[Dataset] = (),
-    missing: Callable[[Uncertainty], tuple[Finding, ...]] | None = None,
+    missing: Callable[[Uncertainty], Missing] | None = None,
     runs: Sequence[FloatArray] | None = None,
 ) -> Suspicion | None:
     """What the model may lack by the training records; None where that cannot be tested.
 
     By free runs, or innovations where noise of the inputs moves these so far that a filter averages
     it; not where equations bend over what is left of it, since a filter does not see that.
-    validation: on which a variant that is fitted must do no worse. missing: the findings of
-    ``score_tests_of``, where these have been begun elsewhere. runs: of ``examined`` on each
+    validation: on which a variant that is fitted must do no worse. missing: as of
+    ``score_tests_of``, where these tests have been begun elsewhere. runs: of ``examined`` on each
     training record, where they are at hand.
     """
     if uncertainty is None:
@@ -141,21 +141,19 @@ def suspected(
         if any(p.pushed for p in uncertainty.parameters):
             # What an end of a range leaves looks like something missing.
             freed = _freed(estimator.final_objective(list(training)), estimator.final_chromosome_)
-            findings = missing_physics(*freed, uncertainty)
+            tested = missing_physics(*freed, uncertainty)
         else:
-            missing = missing or score_tests_of(estimator, training).findings
-            findings = missing(uncertainty)
+            missing = missing or score_tests_of(estimator, training).missing
+            tested = missing(uncertainty)
     except ModelError:  # equations that cannot be added to, or a run that fails
         return None
-    unseen = tuple(f for f in findings if f.kind == "unseen")
-    findings = tuple(f for f in findings if f.kind != "unseen")
     findings = tuple(
         moved_by_noise(f, estimator, uncertainty, training) if f.kind == "noise" else f
-        for f in findings
+        for f in tested.findings
     )
     findings = with_latencies(findings, estimator, uncertainty, training)
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
-    return Suspicion(findings, fitted, unseen)
+    return Suspicion(findings, fitted, tested.unseen)
 
 
 def score_tests_of(estimator: GASSI, training: Sequence[Dataset]) -> ScoreTests:

@@ -43,8 +43,8 @@ class Finding:
     other shapes that it is like as well, between which fits decide. of_input: whether a channel is
     an input. p_value: by chance, all tests counted. share: of the whitened residuals' squares that
     it explains. moves: the farthest first. wider: how many times as wide the interval is that it
-    widens most. cure: of what would not be seen, what would show it. alike: channels, of which the
-    same fault would look the same in these data; instead: other faults that explain nearly as much.
+    widens most. alike: channels, of which the same fault would look the same in these data;
+    instead: other faults that explain nearly as much.
     """
 
     kind: Kind
@@ -58,7 +58,6 @@ class Finding:
     of_input: bool = False
     wider: float = 1.0
     rivals: tuple[AddedTerm, ...] = ()
-    cure: str = ""
     alike: tuple[str, ...] = ()
     instead: tuple["Finding", ...] = ()
 
@@ -70,8 +69,7 @@ class Finding:
     @property
     def counts(self) -> bool:
         """Whether it moves a parameter noticeably, widens intervals, or is much of what is left."""
-        seen = self.kind != "unseen"
-        return seen and (self.farthest > MOVED or self.share > _LARGE or self.widens)
+        return self.farthest > MOVED or self.share > _LARGE or self.widens
 
     @property
     def widens(self) -> bool:
@@ -92,6 +90,31 @@ class Finding:
     def turned_round(self) -> bool:
         """Whether a channel has the opposite sign of what the model has."""
         return self.kind == "gain" and (self.amplitude or 0.0) < _TURNED
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """What these data would not show, and what the fit would have taken it for.
+
+    moves: the farthest first. cure: a sentence on what would show it.
+    """
+
+    text: str
+    moves: tuple[Move, ...]
+    cure: str
+
+    @property
+    def farthest(self) -> float:
+        """Standard deviations by which it moves what it moves farthest."""
+        return abs(self.moves[0].deviations) if self.moves else 0.0
+
+
+@dataclass(frozen=True)
+class Missing:
+    """What a model lacks, the surest first; where that counts for nothing, what may be unseen."""
+
+    findings: tuple[Finding, ...] = ()
+    unseen: tuple[Unseen, ...] = ()
 
 
 _WORDS = {
@@ -133,7 +156,7 @@ def description(finding: Finding) -> str:
 
 def _name_of(finding: Finding) -> str:
     amplitude, unit = finding.amplitude, "" if finding.unit == "1" else finding.unit
-    if finding.kind in ("variant", "unseen"):
+    if finding.kind == "variant":
         return finding.name
     if finding.term is not None:
         return _term_text(finding.term)

@@ -71,8 +71,11 @@ def with_latencies(
         return findings
     model, dt = estimator.simulator().model, training[0].dt
     held = _exact_and_held(model, training)
-    together = [held] if len(held) > 1 else []
-    for places in [*([i] for i in held), *together]:
+    groups = [[i] for i in held] + [held] * (len(held) > 1)
+    # All inputs later is the only output earlier.
+    if len(model.outputs) == 1 and surest.kind == "delay" and not surest.of_input:
+        groups = [places for places in groups if len(places) < len(model.inputs)]
+    for places in groups:
         pair = _later(estimator, training, places, dt)
         if pair is not None and not _lacks(pair[1], uncertainty):
             names = [model.input_names[i] for i in places]
@@ -162,7 +165,7 @@ def _vertex(tried: Sequence[_Moved]) -> float:
 def _lacks(late: _Moved, uncertainty: Uncertainty) -> bool:
     """Whether something that counts is found where a fit ended."""
     try:
-        findings = missing_physics(late.objective, late.chromosome, uncertainty)
+        findings = missing_physics(late.objective, late.chromosome, uncertainty).findings
     except ModelError:
         return True
     return any(finding.counts for finding in findings)

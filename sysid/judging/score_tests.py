@@ -33,7 +33,7 @@ from sysid.judging.background import Background, of_filter, of_free_runs, quiet_
 from sysid.judging.cycles import cycle_suspects
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.feedback import answer_probability, answers
-from sysid.judging.findings import MOVED, Finding, Move, moves_of
+from sysid.judging.findings import MOVED, Finding, Missing, Move, Unseen, moves_of
 from sysid.judging.phrases import sized
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
@@ -100,13 +100,13 @@ _FREEDOM, _UNBOUND = 1.0, 1e6
 
 def missing_physics(
     objective: Objective, chromosome: FloatArray, uncertainty: Uncertainty
-) -> tuple[Finding, ...]:
-    """What the model lacks by the records of an objective at its minimum, the surest first.
+) -> Missing:
+    """What the model lacks by the records of an objective at its minimum.
 
     Faults of channels and the model's variants are tried before functions in the equations.
     Raises ModelError where the free run at the chromosome fails.
     """
-    return ScoreTests(objective, chromosome).findings(uncertainty)
+    return ScoreTests(objective, chromosome).missing(uncertainty)
 
 
 class ScoreTests:
@@ -156,20 +156,19 @@ class ScoreTests:
             return False
         return any(map(self._tests.are_significant, (self._named, self._functions)))
 
-    def findings(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
-        """What the model lacks, the surest first, and how far it moves what has intervals.
-
-        Where that is nothing that counts, behind it what may be there and would not be seen.
-        """
-        findings = () if self._exact else self._significant(uncertainty)
-        if self._exact or any(finding.counts for finding in findings):
-            return findings
+    def missing(self, uncertainty: Uncertainty) -> Missing:
+        """What the model lacks, and how far it moves what has intervals."""
+        if self._exact:
+            return Missing()
+        findings = self._significant(uncertainty)
+        if any(finding.counts for finding in findings):
+            return Missing(findings)
         tests = self._answered.of(uncertainty)
         feedback = tests.feedback(self._answering)
         # What an input answers later looks as if it were late.
         rest = (f for f in findings if not (self._answering and f.comes_late))
         unseen = () if feedback else tests.unseen(possibilities(self._runs, self._named))
-        return (*feedback, *rest, *unseen)
+        return Missing((*feedback, *rest), unseen)
 
     def _significant(self, uncertainty: Uncertainty) -> tuple[Finding, ...]:
         """What is there by more than chance."""
@@ -260,20 +259,20 @@ class _Tests:
         name = min(answering, key=lambda each: answering[each])
         return (Finding("feedback", name, "", 1.0, answering[name], 0.0, moves, of_input=True),)
 
-    def unseen(self, possibilities: Iterable[Possibility]) -> tuple[Finding, ...]:
+    def unseen(self, possibilities: Iterable[Possibility]) -> tuple[Unseen, ...]:
         """What may be there and would not be seen, and moves an estimate farthest, farthest first.
 
         Each moves one farther than those before it do.
         """
         if self._local.corrects:  # what its innovations take up is not known
             return ()
-        findings = [finding for p in possibilities if (finding := self._unseen(p)) is not None]
-        findings.sort(key=lambda finding: -finding.farthest)
-        farthest, chosen = dict[str, float](), list[Finding]()
-        for finding in findings:
-            sizes = {move.quantity.name: abs(move.deviations) for move in finding.moves}
+        every = [unseen for p in possibilities if (unseen := self._unseen(p)) is not None]
+        every.sort(key=lambda unseen: -unseen.farthest)
+        farthest, chosen = dict[str, float](), list[Unseen]()
+        for unseen in every:
+            sizes = {move.quantity.name: abs(move.deviations) for move in unseen.moves}
             if any(size > max(_HIDDEN, farthest.get(n, 0.0)) for n, size in sizes.items()):
-                chosen.append(finding)
+                chosen.append(unseen)
             farthest |= {n: max(size, farthest.get(n, 0.0)) for n, size in sizes.items()}
         return tuple(chosen)
 
@@ -282,7 +281,7 @@ class _Tests:
         names = self._local.objective.simulator.model.parameter_names
         return quantity.combination is not None or quantity.name in names
 
-    def _unseen(self, possibility: Possibility) -> Finding | None:
+    def _unseen(self, possibility: Possibility) -> Unseen | None:
         """What a possibility would move while it is not seen; None of what a parameter does."""
         changes = possibility.suspect.changes / self._scales[..., None]
         flat, slopes = changes.ravel(), self._local.slopes.reshape(changes.size, -1)
@@ -295,11 +294,7 @@ class _Tests:
         every = map(self._within_limits, moves_of(self._estimates, moved.tolist()))
         moves = tuple(move for move in every if self._is_asked(move.quantity))
         size = sized(amplitude * possibility.size, possibility.unit, 2)
-        text, suspect = possibility.words.format(size=size), possibility.suspect
-        unit, cure = suspect.unit, possibility.cure
-        return Finding(
-            "unseen", text, unit, amplitude, 1.0, 0.0, moves, of_input=suspect.of_input, cure=cure
-        )
+        return Unseen(possibility.words.format(size=size), moves, possibility.cure)
 
     def answering(
         self, runs: Sequence[DisturbedRun], channels: Sequence[Suspect]

@@ -46,7 +46,6 @@ Kind = Literal[
     "fixed",
     "exchange",
     "feedback",
-    "unseen",
 ]
 
 SPEEDS = ("rad/s", "deg/s", "m/s", "cm/s", "mm/s")  # units of what turns or slides

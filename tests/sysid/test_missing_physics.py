@@ -841,7 +841,7 @@ def test_nothing_is_found_that_physics_forbids(pwm):
     """Lines led to a friction that changes by -427 % of its mean, and a negative time constant."""
     log = opened(pwm)
     fitted = GASSI(FIRST_ORDER, population=60, generations=12).fit(log)
-    findings = score_tests_of(fitted, [log]).findings(fitted.uncertainty([log]))
+    findings = score_tests_of(fitted, [log]).missing(fitted.uncertainty([log])).findings
     moves = [
         move for finding in findings for move in finding.moves if "(" not in move.quantity.name
     ]
