@@ -12,7 +12,8 @@ design of experiments for discriminating between two rival models", Biometrika 6
 noncentrality of the likeliest test between the two, that along V^-1 e.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,9 +85,9 @@ def nested(rival: Hypothesis, names: Sequence[str], values: FloatArray) -> Float
     return chromosome if space.feasible(chromosome) else rival.values
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answer:
-    """What a run would log if a structure were right.
+    """What a run would log if a structure were right; the same object twice: a run made twice.
 
     outputs: (n_samples, n_outputs). error_filter: of the errors of all of them. n_steps: of the
     integration, for all structures.
@@ -116,7 +117,7 @@ def answer(structure: Hypothesis, record: Dataset, n_steps: int) -> Answer:
     return Answer(record, outputs, error_filter, n_steps)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contrast:
     """What a rival leaves of an answer, and how it would move.
 
@@ -201,11 +202,11 @@ class RivalFit:
         self, answers: Sequence[Answer], rival: Hypothesis, start: FloatArray, effort: Effort
     ) -> None:
         space = rival.space
-        self._answers, self._rival, self._effort = answers, rival, effort
+        self._answers, self._rival, self._effort = Counter(answers), rival, effort
         self._low, self._high = space.coded_lower, space.coded_lower + space.width
         self._small, self._damping = 0, _DAMPING
         self.at = np.clip(space.encode(start), self._low, self._high)
-        self._joint, self._contrasts = _joint(answers, rival, self.at)
+        self._joint, self._contrasts = _joint(self._answers, rival, self.at)
 
     @property
     def left(self) -> float:
@@ -249,22 +250,23 @@ class RivalFit:
 
 
 def _joint(
-    answers: Sequence[Answer], rival: Hypothesis, at: FloatArray
-) -> tuple[FloatArray, list[Contrast]]:
-    """The M of all answers at coordinates (n_free,), and what it is the sum of."""
-    contrasts = [contrast(each, rival, rival.space.decode(at)) for each in answers]
-    total: FloatArray = np.sum([each.joint for each in contrasts], axis=0)
+    answers: Mapping[Answer, int], rival: Hypothesis, at: FloatArray
+) -> tuple[FloatArray, Counter[Contrast]]:
+    """The M of all answers, each so often, at coordinates (n_free,), and what it is the sum of."""
+    chromosome = rival.space.decode(at)
+    contrasts = Counter({contrast(each, rival, chromosome): k for each, k in answers.items()})
+    total: FloatArray = np.sum([k * each.joint for each, k in contrasts.items()], axis=0)
     return total, contrasts
 
 
-def _rest(contrasts: Sequence[Contrast], rival: Hypothesis, coded: FloatArray) -> FloatArray:
+def _rest(contrasts: Mapping[Contrast, int], rival: Hypothesis, coded: FloatArray) -> FloatArray:
     """What is left of all answers at coordinates (n, n_free), infinite where one may not stand."""
     chromosomes = rival.space.decode(coded)
     places = [k for k, each in enumerate(chromosomes) if rival.space.feasible(each)]
     left = np.full(len(coded), np.inf)
     if places:
         vectors = rival.space.full(chromosomes[places])
-        left[places] = sum(each.left(rival, vectors) for each in contrasts)
+        left[places] = sum(k * each.left(rival, vectors) for each, k in contrasts.items())
     return np.where(np.isnan(left), np.inf, left)
 
 
