@@ -1,23 +1,29 @@
 """Which structures designed experiments tell apart, beside the shipped PRBS of equal time.
 
-python -m benchmarks.discriminate [--json] [--seeds 2] [--time 5] [--candidates 32]
+python -m benchmarks.discriminate [--json] [--seeds 2] [--time 5] [--repeats 8] [--candidates 32]
     [--hysteresis bouc-wen dahl lugre] [--friction none stribeck]
+    [--rig free_shaft.yaml] [--model actuator:limits=true,load=free,sensor=between]
 
 What is known before is that hidden values are within a factor of 0.6 to 1.6 of the nominal ones.
 For each pair the noncentrality of the refitted rival, and the probability that a test at 1 %
-refuses it, both at the nominal values. Then, for each seed and each structure as the truth, hidden
-parameters are drawn, the runs are simulated with noise of the sensors and with what noise of the
-measured torque does to the right model, and every structure is fitted to them: a pair is separated
-where the BIC of the rival is larger by more than 10. (A rival is not fitted by the noisy torque
-itself: what noise of an input does to parameters is the identification's matter.) A truth of which
-a run would pass a limit is counted beside.
+refuses it, both at the nominal values and of each run once. Then, for each seed and each structure
+as the truth, hidden parameters are drawn, the runs are simulated, each ``repeats`` times, with
+noise of the sensors and with what noise of a measured torque does to the right model, and every
+structure is fitted to them: a pair is separated where the BIC of the rival is larger by more than
+10. (A rival is not fitted by a noisy torque itself: what noise of an input does to parameters is
+the identification's matter.) A truth of which a limit would stop a run is counted beside.
+
+With the load on the shaft and its torque measured (``--rig simulated.yaml --model actuator``) the
+noise of that torque hides LuGre's damping, and the cable bounds what a run may do.
 """
 
 from __future__ import annotations
 
+import sys
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,13 +38,35 @@ from sysid.arrays import FloatArray
 from sysid.experiments import Prior, rivals
 from sysid.experiments.experiment import deviations_of
 from sysid.experiments.information import Informant
-from sysid.experiments.rivals import Answer, Hypothesis, nested
+from sysid.experiments.rivals import FULL, Answer, Effort, Hypothesis, RivalFit, nested
+from sysid.experiments.tournament import CLEAR
 from sysid.threads import Workers, available_cores, one_thread
 
+RIG, MODEL = "free_shaft.yaml", "actuator:limits=true,load=free,sensor=between"
+CHECKS = 64  # of the parameters with which runs must keep the limits
 RATE, RUN = 800.0, 1.25  # Hz, s
 ACCURACY = 1e-2  # of rigs and fits alike, by the same steps
 STRONG = 10.0  # difference of BIC
+ITERATIONS = 100  # of a fit
+SHARE = 0.05  # of what a rival leaves too much, by which an iteration is to lower it
+# Iterations after which the second fit of a rival ends if it leaves more than the first by so much.
+HEAT, HOPELESS = 10, 10.0
 SPREAD = 0.6, 1.6  # of hidden values about the nominal ones
+
+
+@dataclass(frozen=True)
+class Excess(Effort):
+    """Ends a fit to a noisy log where it gains little of what it leaves beyond the right one.
+
+    right: the score of the right structure.
+    """
+
+    right: float
+
+    def little(self, gain: float, left: float) -> bool:
+        """Whether a gain decides nothing."""
+        excess = left - self.right
+        return gain < (self.share * excess if excess > CLEAR else self.most)
 
 
 def main() -> None:
@@ -48,24 +76,26 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=32, help="runs tried at random")
     parser.add_argument("--hysteresis", nargs="+", default=["bouc-wen", "dahl", "lugre"])
     parser.add_argument("--friction", nargs="+", default=["none", "stribeck"])
+    parser.add_argument("--rig", default=RIG, help="on which runs are made")
+    parser.add_argument("--model", default=MODEL, help="of which structures are variants")
+    parser.add_argument("--repeats", type=int, default=8, help="how often each run is made")
     options = parser.parse_args()
     structures = {"hysteresis": options.hysteresis, "friction": options.friction}
-    question = {"structures": structures, "time": options.time, "run": RUN, "checks": 8}
-    search = {"candidates": options.candidates, "generations": 3, "offspring": 8}
-    report(figures(TypedSettings.of({**question, **search}), options.seeds), options.json, show)
+    question = {"structures": structures, "time": options.time, "run": RUN, "checks": CHECKS}
+    question |= {"rig": options.rig, "model": options.model}
+    question |= {"candidates": options.candidates, "generations": 3, "offspring": 8}
+    report(figures(question, options.seeds, options.repeats), options.json, show)
 
 
-def figures(question: TypedSettings, seeds: int) -> dict[str, Any]:
-    setups = {
-        name: replace(each, prior=within_spread(each.space))
-        for name, each in set_up_structures(question).items()
-    }
+def figures(question: Mapping[str, Any], seeds: int, repeats: int) -> dict[str, Any]:
+    setups = of_question(question)
     begin = time.perf_counter()
     designed = discrimination.choose(setups)
     seconds = time.perf_counter() - begin
     shipped = load_experiment("prbs.yaml").experiment.plan().commands
     runs = {"designed": [run.inputs for run in designed.runs]}
     runs["prbs"] = [shipped[: round(RUN * RATE)]] * len(designed.runs)
+    rigs = of_question({**question, "margin": 0.0})  # what stops a run is the limit itself
     judged = {"designed": designed, "prbs": of_fixed(setups, runs["prbs"])}
     return {
         "seconds": seconds,
@@ -73,9 +103,17 @@ def figures(question: TypedSettings, seeds: int) -> dict[str, Any]:
         "runs": [{"protocol": run.excitation, **run.settings} for run in designed.runs],
         "predicted": {name: table(each) for name, each in judged.items()},
         "separated": {
-            name: [separated(setups, commands, seed) for seed in range(seeds)]
+            name: [counted(name, rigs, commands * repeats, seed) for seed in range(seeds)]
             for name, commands in runs.items()
         },
+    }
+
+
+def of_question(question: Mapping[str, Any]) -> dict[str, Setup]:
+    """A question's structures, with what is known before."""
+    return {
+        name: replace(each, prior=within_spread(each.space))
+        for name, each in set_up_structures(TypedSettings.of(dict(question))).items()
     }
 
 
@@ -116,6 +154,18 @@ def table(judged: Discrimination | None) -> list[dict[str, Any]] | None:
     ]
 
 
+def counted(
+    name: str, setups: Mapping[str, Setup], commands: Sequence[FloatArray], seed: int
+) -> dict[str, Any]:
+    """As ``separated``, and a line of it when it is there."""
+    of_seed = separated(setups, commands, seed)
+    missed = [pair for pair, more in of_seed["differences"].items() if more <= STRONG]
+    print(f"{name}, seed {seed}: {of_seed['separated']} of {of_seed['pairs']}, "
+          f"{of_seed['beyond_limits']} beyond limits; {'; '.join(missed)}",
+          file=sys.stderr, flush=True)  # fmt: skip
+    return of_seed
+
+
 @one_thread()
 def separated(
     setups: Mapping[str, Setup], commands: Sequence[FloatArray], seed: int
@@ -124,8 +174,8 @@ def separated(
     hypotheses = [hypothesis(name, each) for name, each in setups.items()]
     rng = np.random.default_rng(seed)
     tasks, beyond = [], 0
-    for i, truth in enumerate(hypotheses):
-        hidden = drawn(truth.space, rng)
+    rigs = [drawn(each.space, rng) for each in hypotheses]  # the same whatever the runs
+    for i, (truth, hidden) in enumerate(zip(hypotheses, rigs, strict=True)):
         answers = noisy(truth, hidden, list(setups.values())[i], commands, rng)
         if answers is None:
             beyond += 1
@@ -139,12 +189,14 @@ def separated(
 
     def fit(task: tuple[int, int, list[Answer], FloatArray]) -> None:
         i, j, answers, start = task
-        rival = hypotheses[j]
-        left = min(rivals.refit(answers, rival, begin)[1] for begin in (rival.values, start))
+        rival, right = hypotheses[j], scores.get((i, i))
+        left = least_left(answers, rival, start, right)
         n = sum(each.outputs.size for each in answers)
         scores[i, j] = left + len(rival.values) * float(np.log(n))
 
-    Workers(available_cores()).each(fit, tasks)
+    workers = Workers(available_cores())
+    workers.each(fit, [task for task in tasks if task[0] == task[1]])
+    workers.each(fit, [task for task in tasks if task[0] != task[1]])
     names = [each.name for each in hypotheses]
     told = {f"{names[i]} / {names[j]}": scores[i, j] - scores[i, i] for i, j, *_ in tasks if i != j}
     return {
@@ -153,6 +205,24 @@ def separated(
         "beyond_limits": beyond,
         "differences": told,
     }
+
+
+def least_left(
+    answers: Sequence[Answer], rival: Hypothesis, start: FloatArray, right: float | None
+) -> float:
+    """What a rival leaves of noisy logs, fitted from its likeliest values and another start.
+
+    right: the score of the right structure, None where that is fitted.
+    """
+    effort = FULL
+    if right is not None:
+        effort = Excess(SHARE, FULL.most, FULL.patience, FULL.nothing, right)
+    near, likeliest = (RivalFit(answers, rival, at, effort) for at in (start, rival.values))
+    near.advance(ITERATIONS)
+    likeliest.advance(HEAT)
+    if likeliest.left - near.left < HOPELESS * max(near.left - (right or 0.0), CLEAR):
+        likeliest.advance(ITERATIONS)
+    return min(near.left, likeliest.left)
 
 
 def in_terms_of(
@@ -192,21 +262,27 @@ def noisy(
     """
     there = replace(truth, values=hidden)
     of_inputs = np.array([setup.noise.get(name, 0.0) for name in setup.problem.model.input_names])
-    answers = []
-    for each in commands:
-        records = setup.bench.records(each, 1.0 / RATE, truth.space.full(hidden[None]))
-        if records is None:
+    answers: list[Answer] = []
+    places = {id(each): each for each in commands}
+    for place, count in Counter(map(id, commands)).items():
+        each = places[place]
+        record = setup.bench.logged(each, 1.0 / RATE, truth.space.full(hidden[None])[0])
+        if record is None:
             return None
-        (record,) = records
         steps = int(truth.simulator.steps_of_each(truth.space.full(hidden[None]), record)[0])
         answer, shape = rivals.answer(there, record, steps), record.inputs.shape
         vector, n_steps = truth.space.full(hidden[None]), answer.n_steps
-        noisy = replace(record, inputs=record.inputs + of_inputs * rng.standard_normal(shape))
-        by_inputs = truth.simulator.trajectories(vector, noisy, n_steps)[0] - answer.outputs
         # Of a speed between edges, what their instants err by as well.
-        variances = truth.informant.variances(record, answer.outputs[None])[0]
-        by_sensors = np.sqrt(variances) * rng.standard_normal(variances.shape)
-        answers.append(replace(answer, outputs=answer.outputs - by_inputs + by_sensors))
+        deviations = np.sqrt(truth.informant.variances(record, answer.outputs[None])[0])
+        errors = np.zeros(deviations.shape)
+        for _ in range(count):
+            errors += deviations * rng.standard_normal(deviations.shape)
+            if not of_inputs.any():
+                continue
+            noisy = replace(record, inputs=record.inputs + of_inputs * rng.standard_normal(shape))
+            errors -= truth.simulator.trajectories(vector, noisy, n_steps)[0] - answer.outputs
+        # Of runs that are alike their mean tells all: what each differs from it by no model moves.
+        answers += [replace(answer, outputs=answer.outputs + errors / count)] * count
     return answers
 
 

@@ -117,6 +117,23 @@ class PlantBench:
         commanded = {name: np.broadcast_to(inputs[:, j], rows) for j, name in enumerate(COMMANDED)}
         return {**commanded, **self._run(inputs, dt, vectors, int(steps.max()))}
 
+    def logged(
+        self, inputs: FloatArray | Feedback, dt: float, vector: FloatArray
+    ) -> Dataset | None:
+        """What a run would log if parameters were these, None where a limit would stop it.
+
+        vector: (n_parameters,). ``records`` refuses more: what would lead the model astray.
+        """
+        if isinstance(inputs, Feedback):
+            run = self._play(inputs, dt, vector)
+            if run is None or not self._allowed(run, dt):
+                return None
+            return self._record(run.commands, dt, run.signals, 0)
+        steps, _ = self._finer(inputs, dt, vector[None])
+        signals = self._run(inputs, dt, vector[None], int(steps[0]))
+        allowed = self._commands_allowed(inputs, dt) and self._within_limits(inputs, dt, signals)
+        return self._record(inputs, dt, signals, 0) if allowed else None
+
     def _open_loops(
         self, inputs: FloatArray, dt: float, vectors: FloatArray
     ) -> Sequence[Dataset] | None:

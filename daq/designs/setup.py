@@ -30,6 +30,7 @@ from daq.progress import Note, Watch, ignore
 from sysid import ModelError, ProcessModel, SearchSpace
 from sysid.experiments import Prior
 
+_ITS_OWN = "turns", "limits"  # options of a model: a plant has ends, and a question winds it up
 _TURNS = 5.0  # of a cable, where a question does not say how many to wind
 
 
@@ -222,7 +223,7 @@ def _plant(
     try:
         if parts:
             options = [option.split("=", 1) for option in parts.split(",")]
-            values = {key: yaml.safe_load(value) for key, value in options}
+            values = {key: yaml.safe_load(value) for key, value in options if key not in _ITS_OWN}
             device = load_rig(rig, {"plant": values})[1]
             assert isinstance(device, Simulation)
         plant: ProcessModel = device.plant_model(turns)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import takewhile
 
 import numpy as np
@@ -15,7 +14,6 @@ from sysid.experiments.experiment import (
     ChosenRuns,
     designed_run,
     deviations_of,
-    kept_by_all,
     tried_with,
 )
 from sysid.experiments.feedback import Feedback
@@ -26,7 +24,6 @@ from sysid.experiments.search import RunCandidate, Search
 from sysid.experiments.tournament import (
     CLEAR,
     EVEN,
-    SURE,
     AnsweredRun,
     Point,
     Tournament,
@@ -38,6 +35,7 @@ from sysid.problem.model import ModelError, ProcessModel
 from sysid.problem.space import SearchSpace
 from sysid.threads import Workers, available_cores, one_thread
 
+_TRIED = 8  # parameters of each structure at most with which a run is tried before it is chosen
 _REFITS = 2  # of all rivals, between generations of runs
 _SURE = 0.95  # power from which a pair counts as told apart
 _COARSER, _COARSEST = 100.0, 0.1  # times the accuracy, and its end, while runs are searched for
@@ -177,22 +175,10 @@ def discriminate(
     ]
     tournament = Tournament(structures, workers, rng)
 
-    refusals = dict.fromkeys(range(len(structures)), 0)
-
-    def logged(inputs: FloatArray | Feedback, dt: float, n: int) -> list[Dataset] | None:
-        records: dict[int, Dataset] = {}
-        for place in sorted(refusals, key=refusals.__getitem__, reverse=True):
-            bench = benches[structures[place].name]
-            each = bench.records(inputs, dt, vectors[place][:n])
-            if each is None:
-                refusals[place] += 1  # is asked sooner, to be done with what will be refused
-                return None
-            records[place] = each[0]
-        return [records[place] for place in range(len(structures))]
+    rig = _AnyStructure([benches[each.name] for each in structures], vectors)
 
     def evaluate(excitation: Excitation, genes: FloatArray) -> RunCandidate | None:
-        inputs = excitation.signal(genes)
-        records = logged(inputs, excitation.dt, tried_with(inputs, 1, checks))
+        records = rig.records(excitation.signal(genes), excitation.dt)
         if records is None:
             return None
         answers = tuple(takewhile(lambda each: each.steady, tournament.answers(records)))
@@ -201,8 +187,7 @@ def discriminate(
         return tournament.judged(AnsweredRun(excitation, genes, tournament.unjudged(), answers))
 
     aim = tournament.criterion()
-    confirm = partial(kept_by_all, lambda inputs, dt: logged(inputs, dt, checks))
-    search = Search(excitations, evaluate, aim, rng, runs, workers, watch, confirm)
+    search = Search(excitations, evaluate, aim, rng, runs, workers, watch, rig.keeps)
     search.scatter(candidates)
     begins = tournament.begins(tournament.likeliest(), 1)
     few = _answers(search.pool[: -(-runs // 2)])
@@ -219,19 +204,56 @@ def discriminate(
             search.choose()
         chosen = [search.pool[i] for i in search.chosen]
         foreseen = aim.distances(search.total()[None])[0]
-        latest = tournament.points[-1:]
+        latest = [tournament.points[-1], tournament.likeliest()]
         point, distances = tournament.refit(_answers(chosen), latest, ROUGH, foreseen, CLEAR)
         tournament.possible = tournament.possible | (power(distances) > EVEN)
         tournament.points.append(point)
         sets.append((chosen, point, distances))
     possible = tournament.possible
     chosen, point, _ = min(sets, key=lambda each: float(shortfall(each[2][possible])))
-    begins = tournament.begins(point, starts)
+    begins = [point, *tournament.begins(tournament.likeliest(), starts - 1)]
     contests = _contests(tournament, _answers(chosen), begins, accuracy)
     runs_of_it = tuple(designed_run(candidate) for candidate in chosen)
     return Discrimination(
         runs_of_it, contests, attempts=search.attempts, refused=search.attempts - search.kept
     )
+
+
+class _AnyStructure:
+    """A rig of which any structure may be right: a bench of each, the same limits.
+
+    vectors: of each structure, (n_checks, n_parameters), with which limits must be kept.
+    """
+
+    def __init__(self, benches: Sequence[Bench], vectors: Sequence[FloatArray]) -> None:
+        self._benches, self._vectors = benches, vectors
+        self._refusals = dict.fromkeys(range(len(benches)), 0)
+
+    def records(
+        self, inputs: FloatArray | Feedback, dt: float, count: int | None = None
+    ) -> list[Dataset] | None:
+        """What a run would log by each structure, None where a limit is passed.
+
+        count: of the parameter vectors that are tried, by default some.
+        """
+        records: dict[int, Dataset] = {}
+        for place in sorted(self._refusals, key=self._refusals.__getitem__, reverse=True):
+            vectors = self._vectors[place][: count or self._some(inputs)]
+            each = self._benches[place].records(inputs, dt, vectors)
+            if each is None:
+                self._refusals[place] += 1  # is asked sooner, to be done with what is refused
+                return None
+            records[place] = each[0]
+        return [records[place] for place in range(len(self._benches))]
+
+    def keeps(self, run: RunCandidate) -> bool:
+        """Whether a run keeps limits with the vectors that it has not been tried with, too."""
+        checks, inputs = len(self._vectors[0]), run.excitation.signal(run.genes)
+        tried = self._some(inputs) >= checks
+        return tried or self.records(inputs, run.excitation.dt, checks) is not None
+
+    def _some(self, inputs: FloatArray | Feedback) -> int:
+        return min(tried_with(inputs, 1, len(self._vectors[0])), _TRIED)
 
 
 def _answers(runs: Sequence[RunCandidate]) -> list[tuple[Answer, ...]]:
@@ -249,10 +271,10 @@ def _contests(
     What is sure is left at that; rivals that come closer go to their ends, and by finer steps.
     """
     point, distances = tournament.refit(runs, begins, ROUGH)
-    point, distances = tournament.refit(runs, [point], FULL, distances, SURE)
+    point, distances = tournament.refit(runs, [point], FULL, distances, CLEAR)
     sharp = tournament.sharper(accuracy)
     sharper = [tuple(sharp.answers([a.record for a in run])) for run in runs]
-    point, distances = sharp.refit(sharper, [point], FULL, distances, SURE)
+    point, distances = sharp.refit(sharper, [point], FULL, distances, CLEAR)
     contests = []
     for c, (i, j) in enumerate(tournament.pairs):
         truth, rival = tournament.structures[i], tournament.structures[j]

@@ -73,6 +73,16 @@ class ErrorFilter:
         single = [each.astype(np.float32) for each in (rows, gains, onward)]
         return cls(single[0], single[1], single[2], 1.0 / np.sqrt(left))
 
+    @classmethod
+    def white(cls, variances: FloatArray) -> Self:
+        """Of errors that are independent as they are: no input is noisy.
+
+        variances: as of ``along``, (n_samples, n_outputs).
+        """
+        n, q = variances.shape
+        nothing, onward = np.zeros((n, q, 0), np.float32), np.zeros((n, 0, 0), np.float32)
+        return cls(nothing, nothing, onward, 1.0 / np.sqrt(np.maximum(variances, _LEAST)))
+
     @property
     def finite(self) -> bool:
         """Whether the run that it goes along stays finite."""
@@ -94,6 +104,8 @@ class ErrorFilter:
         """What is not foretold of errors, (n_samples * n_outputs, n), in its deviations."""
         (n, q), m = self.kept.shape, self.rows.shape[2]
         errors = np.where(self.kept[..., None] > 0.0, columns.reshape(n, q, -1), 0.0)
+        if not m:
+            return np.asarray((errors * self.kept[..., None]).reshape(columns.shape))
         rows, gains, onward = (p.astype(np.float64) for p in (self.rows, self.gains, self.onward))
         nothing, first, left = np.zeros((n, m)), np.zeros(m), np.empty(errors.shape)
         for k in range(errors.shape[2]):

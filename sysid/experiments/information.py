@@ -103,11 +103,11 @@ class Informant:
         outputs: (n_samples, n_outputs), what they say; n_steps: of the integration.
         """
         model, variances = self._simulator.model, self.variances(record, outputs[None])[0]
+        if not len(self._noisy):
+            return ErrorFilter.white(variances)
         intervals = Intervals(model, vector, record.inputs, record.dt, -(-n_steps // _FEWER))
         states = intervals.run(record.initial_state(model))
         error_filter = ErrorFilter.along(intervals, states, variances, self._input_noise)
-        if not len(self._noisy):
-            return error_filter
         vectors = np.hstack([np.tile(vector, (LANES, 1)), np.eye(LANES)])
         moved = self._disturbed.trajectories(vectors, self._with_errors(record, LANES), n_steps)
         moved += np.sqrt(variances) * np.random.default_rng(0).standard_normal(moved.shape)

@@ -12,7 +12,8 @@ design of experiments for discriminating between two rival models", Biometrika 6
 noncentrality of the likeliest test between the two, that along V^-1 e.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,9 +85,9 @@ def nested(rival: Hypothesis, names: Sequence[str], values: FloatArray) -> Float
     return chromosome if space.feasible(chromosome) else rival.values
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answer:
-    """What a run would log if a structure were right.
+    """What a run would log if a structure were right; the same object twice: a run made twice.
 
     outputs: (n_samples, n_outputs). error_filter: of the errors of all of them. n_steps: of the
     integration, for all structures.
@@ -116,7 +117,7 @@ def answer(structure: Hypothesis, record: Dataset, n_steps: int) -> Answer:
     return Answer(record, outputs, error_filter, n_steps)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contrast:
     """What a rival leaves of an answer, and how it would move.
 
@@ -128,10 +129,10 @@ class Contrast:
     starts: FloatArray
     joint: FloatArray
 
-    def left(self, rival: Hypothesis, vectors: FloatArray) -> FloatArray:
-        """What a rival leaves at other parameters (n, n_parameters), (n,).
+    def left(self, rival: Hypothesis, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What a rival leaves at other parameters (n, n_parameters), (n,), and its outputs there.
 
-        Unknown starts are eliminated by the slopes here.
+        Unknown starts are eliminated by the slopes here. Outputs: (n, n_samples, n_outputs).
         """
         truth, starts = self.answer, self.starts
         outputs = rival.simulator.trajectories(vectors, truth.record, truth.n_steps)
@@ -141,13 +142,20 @@ class Contrast:
             if starts.shape[1]:
                 push = starts.T @ errors
                 left -= np.sum(push * (pinvh(starts.T @ starts) @ push), axis=0)
-        return left
+        return left, outputs
 
 
-def contrast(truth: Answer, rival: Hypothesis, chromosome: FloatArray) -> Contrast:
-    """What a rival at a chromosome (n_free,) leaves of an answer."""
-    n_free, vector = len(chromosome), rival.space.full(chromosome)
-    outputs = rival.simulator.trajectories(vector[None], truth.record, truth.n_steps)[0]
+def contrast(
+    truth: Answer, rival: Hypothesis, chromosome: FloatArray, outputs: FloatArray | None = None
+) -> Contrast:
+    """What a rival at a chromosome (n_free,) leaves of an answer.
+
+    outputs: (n_samples, n_outputs), the rival's, where they have been simulated.
+    """
+    n_free = len(chromosome)
+    if outputs is None:
+        vector = rival.space.full(chromosome)[None]
+        outputs = rival.simulator.trajectories(vector, truth.record, truth.n_steps)[0]
     slopes = rival.informant.tangents(truth.record, chromosome, truth.n_steps)
     columns = slopes.reshape(outputs.size, -1)
     errors = (truth.outputs - outputs).reshape(-1)
@@ -201,11 +209,11 @@ class RivalFit:
         self, answers: Sequence[Answer], rival: Hypothesis, start: FloatArray, effort: Effort
     ) -> None:
         space = rival.space
-        self._answers, self._rival, self._effort = answers, rival, effort
+        self._answers, self._rival, self._effort = Counter(answers), rival, effort
         self._low, self._high = space.coded_lower, space.coded_lower + space.width
         self._small, self._damping = 0, _DAMPING
         self.at = np.clip(space.encode(start), self._low, self._high)
-        self._joint, self._contrasts = _joint(answers, rival, self.at)
+        self._joint, self._contrasts = _joint(self._answers, rival, self.at)
 
     @property
     def left(self) -> float:
@@ -233,12 +241,13 @@ class RivalFit:
         weights = self._damping * _DAMPINGS
         moves = _moves(self._joint, self._rival.ridge, weights, at <= low, at >= high)
         offers = np.clip(at + moves, low, high)
-        rest = _rest(self._contrasts, self._rival, offers)
+        rest, outputs = _rest(self._contrasts, self._rival, offers)
         best = int(np.argmin(rest))
         # Where it has no tangents there is no going on: rather less far.
         joint, contrasts = np.full((1, 1), np.inf), self._contrasts
         if rest[best] < left:
-            joint, contrasts = _joint(self._answers, self._rival, offers[best])
+            of_best = {each: of_all[best] for each, of_all in outputs.items()}
+            joint, contrasts = _joint(self._answers, self._rival, offers[best], of_best)
         if not np.isfinite(joint).all():
             self._damping = float(weights[-1])
             return
@@ -249,23 +258,41 @@ class RivalFit:
 
 
 def _joint(
-    answers: Sequence[Answer], rival: Hypothesis, at: FloatArray
-) -> tuple[FloatArray, list[Contrast]]:
-    """The M of all answers at coordinates (n_free,), and what it is the sum of."""
-    contrasts = [contrast(each, rival, rival.space.decode(at)) for each in answers]
-    total: FloatArray = np.sum([each.joint for each in contrasts], axis=0)
+    answers: Mapping[Answer, int],
+    rival: Hypothesis,
+    at: FloatArray,
+    outputs: Mapping[Answer, FloatArray] | None = None,
+) -> tuple[FloatArray, Counter[Contrast]]:
+    """The M of all answers, each so often, at coordinates (n_free,), and what it is the sum of.
+
+    outputs: the rival's there by the answer, where they have been simulated.
+    """
+    chromosome, outputs = rival.space.decode(at), outputs or {}
+    contrasts = Counter({
+        contrast(each, rival, chromosome, outputs.get(each)): k for each, k in answers.items()
+    })  # fmt: skip
+    total: FloatArray = np.sum([k * each.joint for each, k in contrasts.items()], axis=0)
     return total, contrasts
 
 
-def _rest(contrasts: Sequence[Contrast], rival: Hypothesis, coded: FloatArray) -> FloatArray:
-    """What is left of all answers at coordinates (n, n_free), infinite where one may not stand."""
+def _rest(
+    contrasts: Mapping[Contrast, int], rival: Hypothesis, coded: FloatArray
+) -> tuple[FloatArray, dict[Answer, dict[int, FloatArray]]]:
+    """What is left of all answers at coordinates (n, n_free), infinite where one may not stand.
+
+    And the rival's outputs, by the answer and the coordinates' place.
+    """
     chromosomes = rival.space.decode(coded)
     places = [k for k, each in enumerate(chromosomes) if rival.space.feasible(each)]
-    left = np.full(len(coded), np.inf)
+    left, simulated = np.full(len(coded), np.inf), {}
     if places:
         vectors = rival.space.full(chromosomes[places])
-        left[places] = sum(each.left(rival, vectors) for each in contrasts)
-    return np.where(np.isnan(left), np.inf, left)
+        left[places] = 0.0
+        for each, count in contrasts.items():
+            of_it, outputs = each.left(rival, vectors)
+            left[places] += count * of_it
+            simulated[each.answer] = dict(zip(places, outputs, strict=True))
+    return np.where(np.isnan(left), np.inf, left), simulated
 
 
 def _moves(

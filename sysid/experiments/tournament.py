@@ -21,8 +21,7 @@ _ATTEMPTS = 200  # draws for one that keeps a model's constraints
 _MARGIN = 4.0  # of noncentralities, for other parameters: of half the difference
 _SECOND = 1e-3  # what counts where all is sure, so that of equal sets one is the best
 _LEAST = 1e-9  # noncentrality that counts as none
-# Noncentralities of which a refit to other runs will not make little, or one that goes further.
-CLEAR, SURE = 1000.0, 100.0
+CLEAR = 1000.0  # noncentrality of which a refit to other runs, or one further, hardly makes little
 
 Point = Sequence[FloatArray]
 """For each pair the rival's chromosome, (n_free,)."""

@@ -82,6 +82,14 @@ def test_a_run_beyond_any_limit_is_refused(limits, motor):
     assert tight.records(commands(motor), 1.0 / 800.0, vectors) is None
 
 
+def test_a_run_is_logged_unless_a_limit_stops_it():
+    roomy, vectors = bench()
+    (record,) = roomy.records(commands(0.6), 1.0 / 800.0, vectors)
+    logged = roomy.logged(commands(0.6), 1.0 / 800.0, vectors[0])
+    assert np.array_equal(logged.inputs, record.inputs)
+    assert bench(speed=20.0)[0].logged(commands(1.2), 1.0 / 800.0, vectors[0]) is None
+
+
 def test_what_looks_like_a_blow_with_any_of_the_parameters_is_refused():
     loose, vectors = bench()
     inertias = [name in ("J_m", "J_b") for name in actuator().parameter_names]

@@ -42,6 +42,16 @@ def test_each_structure_has_a_plant_of_its_own(plant):
     assert np.abs(speeds[0] - speeds[1]).max() > 0.1
 
 
+def test_a_model_with_a_load_and_amplifiers_ends_may_be_that_of_the_structures():
+    model = "actuator:limits=true,load=pulley,turns=5"
+    several = setups(structures={"hysteresis": ["dahl", "lugre"]}, model=model)
+    commands = np.tile([0.3, 0.1], (200, 1))
+    for each in several.values():
+        vectors = each.problem.model.nominal[None]
+        (record,) = each.bench.records(commands, 1.0 / 800.0, vectors)
+        assert record.inputs.shape == (200, 2)
+
+
 @pytest.mark.parametrize(
     ("question", "named"),
     [

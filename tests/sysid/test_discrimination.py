@@ -95,6 +95,17 @@ def test_what_a_refitted_rival_leaves_is_that_of_the_closed_form():
     assert left == pytest.approx(exact, rel=1e-4)
 
 
+def test_a_run_that_is_made_twice_counts_twice():
+    u = np.linspace(-0.5, 1.5, 60)
+    truth, rival, start = structure(SQUARE), structure(LINEAR), np.array([4.0])
+    log, further = (answer(truth, blank(SQUARE, s * u[:, None], DT), 1) for s in (1.0, 0.3))
+    again = replace(log)  # as much, and computed by itself
+    end, left = refit([log, further, log], rival, start)
+    end_of_both, left_of_both = refit([log, further, again], rival, start)
+    assert end == pytest.approx(end_of_both, rel=1e-9)
+    assert left == pytest.approx(left_of_both, rel=1e-9)
+
+
 @pytest.mark.soak
 def test_a_rival_is_fitted_to_noisy_logs_as_well_as_it_can_be():
     """Along Rosenbrock's valley, of which noise leaves a hundredth part to gain."""

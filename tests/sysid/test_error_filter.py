@@ -56,6 +56,16 @@ def test_an_output_without_weight_counts_nothing():
     assert not both[0][:, 1].any()
 
 
+def test_errors_of_a_run_without_noisy_inputs_are_white_but_for_their_size():
+    variances = np.random.default_rng(0).uniform(0.5, 2.0, (N, 2))
+    variances[3, 1] = np.inf
+    errors = np.random.default_rng(1).standard_normal((N, 2))
+    errors[3, 1] = np.nan
+    whitened = ErrorFilter.white(variances).of(errors.reshape(-1, 1)).reshape(N, 2)
+    expected = np.nan_to_num(errors) / np.sqrt(variances)
+    assert whitened == pytest.approx(expected)
+
+
 def test_what_errs_more_than_foretold_counts_less():
     filtered = error_filter(np.zeros((N, 2)), np.full((N, 2), 1e-4))
     errors = 1e-2 * np.random.default_rng(0).standard_normal((N, 2, 16))
