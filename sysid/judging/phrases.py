@@ -12,8 +12,8 @@ _PREFIXABLE = re.compile(r"(V|A|ohm|H|F|N|W|J|s|Hz|Pa|T|Wb|m|rad)(?![\w^])")
 def sized(value: float, unit: str, digits: int = 3) -> str:
     """A number of so many digits at most, with its unit.
 
-    >>> sized(5.01e-5, "s"), sized(0.25, "s"), sized(8.2e-5, "kg*m^2"), sized(2.0, "1")
-    ('50.1 µs', '0.25 s', '8.2e-5 kg*m^2', '2')
+    >>> sized(5.01e-5, "s"), sized(1e-4, "s", 2), sized(8.2e-5, "kg*m^2"), sized(2.0, "1")
+    ('50.1 µs', '100 µs', '8.2e-5 kg*m^2', '2')
     """
     factor, multiple = _multiple(value, unit)
     return f"{_number(factor * value, digits)} {multiple}".rstrip()
@@ -43,7 +43,9 @@ def either(names: Sequence[str]) -> str:
 
 
 def _number(value: float, digits: int) -> str:
-    return re.sub(r"e([+-])0*", lambda power: f"e{power[1].strip('+')}", f"{value:.{digits}g}")
+    # No power for the sake of digits that are not told: 100, not 1e2.
+    rounded = f"{float(f'{value:.{digits}g}'):.{max(digits, 4)}g}"
+    return re.sub(r"e([+-])0*", lambda power: f"e{power[1].strip('+')}", rounded)
 
 
 def _multiple(value: float, unit: str) -> tuple[float, str]:

@@ -5,6 +5,7 @@ the parameters do, as dry friction of what turns one way only looks like viscous
 tells: the fit takes it up, and intervals, which know nothing of it, are far too narrow.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -64,9 +65,12 @@ def possibilities(
 
 
 def _delays(run: DisturbedRun, channels: Sequence[Suspect]) -> Iterator[Possibility]:
-    """Inputs that act later than they are logged, within a sample, for drivers take their time."""
-    usual = _DELAY * run.record.dt
-    for name in run.model.input_names:
+    """Inputs that act later than they are logged, within a sample, for drivers take their time.
+
+    None of which it is told already how late.
+    """
+    usual, as_logged = _DELAY * run.record.dt, run.record.last_part == 0.0
+    for name in itertools.compress(run.model.input_names, as_logged.tolist()):
         late = next((s.late for s in channels if s.kind == "delay" and s.name == name), None)
         if late is not None:
             suspect = Suspect("delay", name, "s", late(-usual) / usual, of_input=True)
