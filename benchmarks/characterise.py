@@ -2,6 +2,7 @@
 
 python -m benchmarks.characterise [--json] [--rigs 3] [--first 0] [--time 10]
                                  [--model actuator:limits=true] [--keep FOLDER]
+                                 [--set sample_rate=1600]
 
 Each rig is the simulated one with the model's nominal values, each times a factor of 0.6 to 1.6
 drawn anew. It is characterised from the model's ranges within 10 s of logged time; the same rig
@@ -9,8 +10,9 @@ then makes 8 runs of the shipped PRBS, 10 s, with seeds of their own, which are 
 Figures: geometric mean of the ratio of the intervals' widths (of a quantity that the PRBS does not
 bound the ratio counts none), the widest interval, how many hold the truth, and achieved over
 predicted deviations; of each round the same on standard error as it ends, with the runs that
-limits stopped and seconds of processor time. --keep: where the characterisations stay, one folder
-a rig; one that is there is gone on with, and so is one that a limit has stopped.
+limits stopped and seconds of processor time. --set: as of `rig characterise`; the shipped PRBS has
+800 Hz all the same. --keep: where the characterisations stay, one folder a rig; one that is there
+is gone on with, and so is one that a limit has stopped.
 """
 
 from __future__ import annotations
@@ -52,23 +54,26 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
     parser.add_argument("--time", type=float, default=10.0, help="logged time [s]")
     parser.add_argument("--model", default=DRIVEN_MODEL, help="that is identified")
+    parser.add_argument("--set", action="append", default=[], help="key=value of the designs")
     parser.add_argument("--keep", type=Path, help="folder in which the characterisations stay")
     options = parser.parse_args()
     numbers = range(options.first, options.first + options.rigs)
     with tempfile.TemporaryDirectory() as temporary:
         place = options.keep or Path(temporary)
         rigs = [
-            hidden_rig(number, options.time, options.model, place / f"rig-{number}")
+            hidden_rig(number, options.time, options.model, place / f"rig-{number}", options.set)
             for number in numbers
         ]
     report({"rigs": rigs}, options.json, show)
 
 
-def hidden_rig(number: int, seconds: float, name: str, folder: Path) -> dict[str, Any]:
+def hidden_rig(
+    number: int, seconds: float, name: str, folder: Path, settings: Sequence[str] = ()
+) -> dict[str, Any]:
     """Figures of one rig, by the name of the model that is identified."""
     values = hidden_values(number, name)
     begin = time.perf_counter()
-    designed, rounds = _characterised(folder, number, seconds, name)
+    designed, rounds = _characterised(folder, number, seconds, name, settings)
     spent = time.perf_counter() - begin
     shipped = _shipped(folder, folder / "rig.yaml", designed.rounds[-1], number, name)
     bounded = [i for i in designed.intervals if i.width is not None]
@@ -119,7 +124,7 @@ class _Rounds:
 
 
 def _characterised(
-    folder: Path, number: int, seconds: float, name: str
+    folder: Path, number: int, seconds: float, name: str, settings: Sequence[str]
 ) -> tuple[characterise.Characterisation, list[dict[str, Any]]]:
     """A rig's characterisation, gone on with where it has begun, and figures of its rounds."""
     root = folder / "c"
@@ -132,7 +137,7 @@ def _characterised(
                 designed = characterise.resume(root, watch=told.watch)
             else:
                 designed = characterise.characterise(
-                    rig, seconds, None, root, model=name, watch=told.watch
+                    rig, seconds, None, root, model=name, settings=settings, watch=told.watch
                 )
         except InterlockError as error:  # as a person would who reads what stopped it
             print(error, file=sys.stderr, flush=True)
