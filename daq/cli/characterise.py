@@ -159,7 +159,10 @@ def _show(result: Characterisation) -> None:
     if result.missed:
         missed = f"Wider than the {result.precision:g} % wanted: {', '.join(result.missed)}."
         if result.helped_by_time:
-            terminal.print_text(f"{missed} More time goes on from here:")
+            terminal.print_text(
+                f"{missed} Where the device keeps up, more samples in the same time tell more "
+                "(another --set sample_rate, anew). More time goes on from here:"
+            )
             again = f"rig characterise --resume {shlex.quote(str(result.folder))}"
             print(f"{again} --time {2.0 * result.seconds:g}")
         else:
