@@ -76,21 +76,23 @@ class Intervals:
         """What acts in each interval, (n_samples - 1, n_causes).
 
         Inputs, (n_samples, n_inputs), at its begin and what is added to rates, (n_samples,
-        n_states), which may lack the last states; then those of these that are not held at its end.
-        before: rates just before each sample, where these jump there.
+        n_states), or several of these, (n_samples, n_states, k), which may lack the last states;
+        then those of these that are not held at its end. before: rates just before each sample,
+        where these jump there.
         """
         begins = self._causes_at(inputs, rates)
         ends = begins if before is None else self._causes_at(inputs, before)
         return np.hstack([begins[:-1], ends[1:, self.changing]])
 
     def _causes_at(self, inputs: FloatArray | None, rates: FloatArray | None) -> FloatArray:
-        n, signals = len(self.inputs), []
-        for given, like in ((inputs, self.model.inputs), (rates, self.model.states)):
-            signal = np.zeros((n, len(like)))
-            if given is not None:
-                signal[:, : given.shape[1]] = given
-            signals.append(signal)
-        return np.hstack(signals)
+        n, n_inputs = len(self.inputs), len(self.model.inputs)
+        several = () if rates is None else rates.shape[2:]
+        causes = np.zeros((n, n_inputs + len(self.model.states), *several))
+        if inputs is not None:
+            causes[:, : inputs.shape[1]] = inputs
+        if rates is not None:
+            causes[:, n_inputs : n_inputs + rates.shape[1]] = rates
+        return causes
 
     def held(self, inputs: FloatArray) -> FloatArray:
         """As of ``causes``, of inputs (n_samples, n_inputs) that stay as they are for an interval.

@@ -61,7 +61,8 @@ class LinearResponse:
     ) -> FloatArray:
         """Changes of the outputs, or of what is kept of the innovations, (n_samples, n_outputs).
 
-        By what is added to rates, (n_samples, n_states), straight from sample to sample, to inputs,
+        By what is added to rates, (n_samples, n_states), straight from sample to sample, or by each
+        of several of these, (n_samples, n_states, k), alone: (n_samples, n_outputs, k); to inputs,
         (n_samples, n_inputs), and to outputs, (n_samples, n_outputs); start: (n_states,), by where
         the states begin elsewhere; vector: (n_parameters,), by what is added to the equations'
         parameters; held: (n_samples, n_inputs), by what is added to inputs from each sample to the
@@ -70,41 +71,43 @@ class LinearResponse:
         just after each sample. Behind the model's states and outputs stand integrals of those that
         are averaged, which may be left out.
         """
-        n, _, m = self.rows.shape
-        pushes, first = np.zeros((n, m)), np.zeros(m)
+        several = rates is not None and rates.ndim == 3
+        count = rates.shape[2] if rates is not None and several else 1
+        n, q, m = self.rows.shape
+        pushes, first = np.zeros((n, m, count)), np.zeros((m, count))
         if rates is not None or inputs is not None:
             causes = self.slopes.intervals.causes(inputs, rates, before)
-            _push(pushes, self.slopes.by_causes, causes)
+            _push(pushes, self.slopes.by_causes, causes.reshape(*causes.shape[:2], count))
         if held is not None:
-            _push(pushes, self.slopes.by_causes, self.slopes.intervals.held(held))
+            _push(pushes, self.slopes.by_causes, self.slopes.intervals.held(held)[..., None])
         if vector is not None:
-            _push(pushes, self.slopes.by_parameters, np.tile(vector, (n - 1, 1)))
+            _push(pushes, self.slopes.by_parameters, np.tile(vector, (n - 1, 1))[..., None])
         if start is not None:
-            first[: len(start)] = start
+            first[: len(start), 0] = start
         if jumps is not None:
             ahead, after = jumps
-            count = after.shape[1]
-            pushes[:-1, :count] += ahead[1:]
-            pushes += np.einsum("kba,kb->ka", self.onward[:, :count], after)
-        added = np.zeros(self.kept.shape)
+            size = after.shape[1]
+            pushes[:-1, :size, 0] += ahead[1:]
+            pushes[..., 0] += np.einsum("kba,kb->ka", self.onward[:, :size], after)
+        added = np.zeros((n, q, count))
         if outputs is not None:
-            added[:, : outputs.shape[1]] = outputs
-        changes: FloatArray = changes_along(
-            self.rows, self.gains, self.onward, pushes, added, first
-        )
-        return changes * self.kept
+            added[:, : outputs.shape[1], 0] = outputs
+        changes = changes_along(self.rows, self.gains, self.onward, pushes, added, first)
+        changes *= self.kept[..., None]
+        return changes if several else changes[..., 0]
 
 
 @njit(cache=True, nogil=True)
 def _push(pushes: FloatArray, slopes: FloatArray, causes: FloatArray) -> None:
-    """Add to pushes (n_samples, m) what causes (n_samples - 1, n_causes) do by their slopes."""
+    """Add to pushes (n_samples, m, k) what causes (n_samples - 1, n_causes, k) do by slopes."""
     n, n_causes, n_states = slopes.shape
-    for k in range(n):
+    for t in range(n):
         for i in range(n_causes):
-            cause = causes[k, i]
-            if cause != 0.0:
-                for a in range(n_states):
-                    pushes[k, a] += slopes[k, i, a] * cause
+            for c in range(causes.shape[2]):
+                cause = causes[t, i, c]
+                if cause != 0.0:
+                    for a in range(n_states):
+                        pushes[t, a, c] += slopes[t, i, a] * cause
 
 
 @njit(cache=True, nogil=True)
@@ -116,30 +119,33 @@ def changes_along(
     added: FloatArray,
     first: FloatArray,
 ) -> FloatArray:
-    """Changes (n_samples, n_outputs) by deviations that begin at ``first``, (m,).
+    """Changes (n_samples, n_outputs, k) by deviations that begin at ``first``, (m, k).
 
-    Copied in loops: assignments of whole arrays take the compiler three seconds.
+    rows, gains, onward: as of ``LinearResponse``; pushes: (n_samples, m, k), added: (n_samples,
+    n_outputs, k). Copied in loops: assignments of whole arrays take the compiler three seconds.
     """
     n, q, m = rows.shape
-    changes = np.empty((n, q))
-    d, moved = np.empty(m), np.empty(m)
-    for a in range(m):
-        d[a] = first[a]
+    count = added.shape[2]
+    changes = np.empty((n, q, count))
+    d, moved = first.copy(), np.empty((m, count))
     for k in range(n):
         for j in range(q):
-            e = added[k, j]
+            for c in range(count):
+                changes[k, j, c] = added[k, j, c]
             for a in range(m):
-                e += rows[k, j, a] * d[a]
+                for c in range(count):
+                    changes[k, j, c] += rows[k, j, a] * d[a, c]
             for a in range(m):
-                d[a] -= gains[k, j, a] * e
-            changes[k, j] = e
+                for c in range(count):
+                    d[a, c] -= gains[k, j, a] * changes[k, j, c]
         for a in range(m):
-            moved[a] = pushes[k, a]
+            for c in range(count):
+                moved[a, c] = pushes[k, a, c]
         for b in range(m):
             for a in range(m):
-                moved[a] += onward[k, b, a] * d[b]
-        for a in range(m):
-            d[a] = moved[a]
+                for c in range(count):
+                    moved[a, c] += onward[k, b, a] * d[b, c]
+        d, moved = moved, d
     return changes
 
 

@@ -107,10 +107,9 @@ class ErrorFilter:
         if not m:
             return np.asarray((errors * self.kept[..., None]).reshape(columns.shape))
         rows, gains, onward = (p.astype(np.float64) for p in (self.rows, self.gains, self.onward))
-        nothing, first, left = np.zeros((n, m)), np.zeros(m), np.empty(errors.shape)
-        for k in range(errors.shape[2]):
-            column = np.ascontiguousarray(errors[..., k])
-            left[..., k] = changes_along(rows, gains, onward, nothing, column, first)
+        count = errors.shape[2]
+        nothing, first = np.zeros((n, m, count)), np.zeros((m, count))
+        left = changes_along(rows, gains, onward, nothing, np.ascontiguousarray(errors), first)
         whitened: FloatArray = (left * self.kept[..., None]).reshape(columns.shape)
         return whitened
 

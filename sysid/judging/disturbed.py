@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from scipy import ndimage
@@ -34,12 +34,21 @@ _FELT = 1e-3  # part of an output's motion that inputs without noise do at least
 class Rates:
     """Rates of the states just after each sample and just before it, (n_samples, n_states) each.
 
-    Straight from the one to the other; inputs that are held jump at samples. Of what a feedback
-    has made an input of a sample acts after it alone: noise of that sample is in the input as well.
+    Or several, (n_samples, n_states, k). Straight from the one to the other; inputs that are held
+    jump at samples. Of what a feedback has made an input of a sample acts after it alone: noise of
+    that sample is in the input as well.
     """
 
     after: FloatArray
     before: FloatArray
+
+    @classmethod
+    def together(cls, several: Sequence["Rates"]) -> Self:
+        """Rates of which each is by itself, as several."""
+        return cls(
+            np.stack([rates.after for rates in several], axis=2),
+            np.stack([rates.before for rates in several], axis=2),
+        )
 
     def __sub__(self, rates: "Rates") -> "Rates":
         return Rates(self.after - rates.after, self.before - rates.before)
@@ -99,7 +108,7 @@ class DisturbedRun:
     def __post_init__(self) -> None:
         self.states = self.response.states[:, : len(self.model.states)]
         self.outputs = self.over(self.record.windows)
-        self.rates = self.rates_of(self.model.derivative, self.vector)
+        (self.rates,) = rates_of_each([self], self.model.derivative, self.vector)
 
     @property
     def instants(self) -> FloatArray:
@@ -135,14 +144,18 @@ class DisturbedRun:
         instants = observed(self.model, self.states, self.record.inputs, self.vector)
         return self._as_measured(np.hstack([instants, integrals]), windows)
 
-    def rates_of(self, derivative: Callable[..., Any], vector: FloatArray) -> Rates:
-        """Values of another derivative along the run, NaN where it fails."""
+    @property
+    def inputs_before(self) -> FloatArray:
+        """Inputs just before each sample, (n_samples, n_inputs)."""
         inputs, held = self.record.inputs, [given.hold == "zoh" for given in self.model.inputs]
-        before = np.where(held, delayed(inputs), inputs)
-        return Rates(*(rates_along(derivative, self.states, u, vector) for u in (inputs, before)))
+        before: FloatArray = np.where(held, delayed(inputs), inputs)
+        return before
 
     def added(self, rates: Rates) -> FloatArray:
-        """Change of the outputs, (n_samples, n_outputs), per unit of what is added to the rates."""
+        """Change of the outputs, (n_samples, n_outputs), per unit of what is added to the rates.
+
+        Of several (n_samples, n_outputs, k).
+        """
         return self._change(self.response.of(rates=rates.after, before=rates.before))
 
     def driven(self, inputs: FloatArray) -> FloatArray:
@@ -227,11 +240,15 @@ class DisturbedRun:
 
     def _as_measured(self, response: FloatArray, windows: FloatArray) -> FloatArray:
         """Outputs, of a run or what changes in them, averaged ones by their integrals behind."""
-        count = len(self.model.outputs)
+        n, count = len(response), len(self.model.outputs)
         outputs, integrals = response[:, :count].copy(), response[:, count:] / self.record.dt
-        for j, integral in zip(self._averaged, integrals.T, strict=True):
-            within = windows[:, j] / self.record.dt
-            outputs[:, j] = average(outputs[:, [j]], integral[:, None], within)[:, 0]
+        for place, j in enumerate(self._averaged):
+            values, areas = (
+                np.ascontiguousarray(table.reshape(n, -1))
+                for table in (outputs[:, j], integrals[:, place])
+            )
+            means = average(values, areas, windows[:, j] / self.record.dt)
+            outputs[:, j] = means.reshape(outputs[:, j].shape)
         return outputs
 
 
@@ -252,8 +269,25 @@ def shifted(signal: FloatArray, samples: float, held: bool) -> FloatArray:
     return later[_BEYOND:-_BEYOND] - signal
 
 
+def rates_of_each(
+    runs: Sequence[DisturbedRun], derivative: Callable[..., Any], vector: FloatArray
+) -> list[Rates]:
+    """Values of a derivative along each run, NaN where it fails: side by side, which is sooner."""
+    states, after, before = (
+        np.concatenate(parts)
+        for parts in zip(*((r.states, r.record.inputs, r.inputs_before) for r in runs), strict=True)
+    )
+    ends = np.cumsum([len(run.states) for run in runs])[:-1]
+    sides = (np.split(rates_along(derivative, states, u, vector), ends) for u in (after, before))
+    return [Rates(*pair) for pair in zip(*sides, strict=True)]
+
+
 def of_each(
-    runs: Sequence[DisturbedRun], change: Callable[[DisturbedRun], FloatArray]
+    runs: Sequence[DisturbedRun], change: Callable[..., FloatArray], *parts: Sequence[Any]
 ) -> FloatArray:
-    """Changes (n_rows, n_outputs) of all runs, records one after another."""
-    return np.concatenate(runs[0].workers.results(change, runs))
+    """Changes (n_rows, n_outputs) of all runs, records one after another.
+
+    parts: what a change is told of each run beside it.
+    """
+    tasks = list(zip(runs, *parts, strict=True))
+    return np.concatenate(runs[0].workers.results(lambda task: change(*task), tasks))

@@ -121,7 +121,7 @@ class FilteredRun(DisturbedRun):
         return observed(self.model, self.states, self.record.inputs, self.vector + vector)
 
     def _change(self, response: FloatArray) -> FloatArray:
-        scaled = response * self.scale
+        scaled = response * (self.scale if response.ndim == 2 else self.scale[:, None])
         return scaled if np.all(np.isfinite(scaled)) else np.zeros_like(scaled)
 
 

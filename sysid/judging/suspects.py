@@ -15,7 +15,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.linear_response import observed
-from sysid.judging.disturbed import DisturbedRun, Rates, delayed, of_each, shifted
+from sysid.judging.disturbed import DisturbedRun, Rates, delayed, of_each, rates_of_each, shifted
 from sysid.judging.input_noise import likely_noise, standing_out
 from sysid.linear.polynomials import all_pole
 from sysid.problem.channels import noise
@@ -65,7 +65,7 @@ _PLAYS = (0.02, 0.1)  # parts of an input's peak
 # in the mean; and mean square of the slopes there in parts of chance.
 _STEP, _STANDS, _RISING = 4.5, 5, 2.0
 _RECORD = 0.1  # of a record, beyond which no delay is tested
-_PROBE = 1e-3  # part of a parameter that tells how rates follow it
+PROBE = 1e-3  # part of a parameter that tells how rates follow it
 _PERIODS = (1, 2, 3, 4)  # of a disturbance that nobody measured, in a record
 # How a parameter may change with the size, up to 1, of what it multiplies: with it, with its
 # square, and near its zero.
@@ -485,12 +485,12 @@ def variant_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         added = [i for i, k in enumerate(variant.parameter_names) if k not in values]
         free = [i for i in added if not variant.parameters[i].fixed]
         moved = [at, *(p for i in free for p in _moved(variant, at, i))]
-        columns = [of_each(runs, partial(_as_variant, variant, p)) for p in moved]
-        yield Suspect("variant", name, "", np.stack(columns, axis=2))
-
-
-def _as_variant(variant: ProcessModel, vector: FloatArray, run: DisturbedRun) -> FloatArray:
-    return run.added(run.rates_of(variant.derivative, vector) - run.rates)
+        rates = zip(*(rates_of_each(runs, variant.derivative, p) for p in moved), strict=True)
+        beside = [
+            Rates.together([each - run.rates for each in several])
+            for run, several in zip(runs, rates, strict=True)
+        ]
+        yield Suspect("variant", name, "", of_each(runs, DisturbedRun.added, beside))
 
 
 def _moved(variant: ProcessModel, vector: FloatArray, place: int) -> Iterator[FloatArray]:
@@ -540,11 +540,9 @@ def of_terms(
     Of a noisy one, whose noise errors go with, straight from mean to mean of two samples.
     """
     state = runs[0].model.states[i]
-    columns = [
-        added_rates(runs, i, partial(_along, term, signal, held and noisy), held=held and not noisy)
-        for term in terms
-    ]
-    return Suspect("function", state.name, f"{state.unit}/s", np.stack(columns, axis=2), terms)
+    along = [partial(_along, term, signal, held and noisy) for term in terms]
+    changes = added_rates(runs, i, along, held=held and not noisy)
+    return Suspect("function", state.name, f"{state.unit}/s", changes, terms)
 
 
 def _along(
@@ -626,8 +624,8 @@ def disturbance_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     ]
     for i in physical_equations(runs[0]):
         state = runs[0].model.states[i]
-        columns = [added_rates(runs, i, wave) for wave in waves]
-        yield Suspect("disturbance", state.name, f"{state.unit}/s", np.stack(columns, axis=2))
+        changes = added_rates(runs, i, waves)
+        yield Suspect("disturbance", state.name, f"{state.unit}/s", changes)
 
 
 def _wave(function: np.ufunc, periods: int, run: DisturbedRun) -> FloatArray:
@@ -639,28 +637,33 @@ def _wave(function: np.ufunc, periods: int, run: DisturbedRun) -> FloatArray:
 def fixed_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Iterator[Suspect]:
     """Parameters, by name, that were held at a value from elsewhere, by parts of that value."""
     for name in names:
-        changes = of_each(runs, partial(_of_another_value, _with_more(name, runs[0])))
+        moved = _with_more(name, runs[0])
+        changes = of_each(runs, partial(_of_another_value, moved), followed(runs, moved))
         yield Suspect("fixed", name, "1", changes[..., None])
 
 
 def _with_more(name: str, run: DisturbedRun) -> FloatArray:
     """The parameters (n_parameters,) of a run with a part more of the named one."""
     vector = run.vector.copy()
-    vector[run.model.parameter_names.index(name)] *= 1.0 + _PROBE
+    vector[run.model.parameter_names.index(name)] *= 1.0 + PROBE
     return vector
 
 
-def _followed(moved: FloatArray, run: DisturbedRun) -> Rates:
-    """How rates follow parameters that are moved by a part of something."""
-    return (run.rates_of(run.model.derivative, moved) - run.rates) * (1.0 / _PROBE)
+def followed(runs: Sequence[DisturbedRun], moved: FloatArray) -> list[Rates]:
+    """How each run's rates follow parameters (n_parameters,) that are moved by a part of something.
+
+    By all of what acts, where that is in proportion to them.
+    """
+    rates = rates_of_each(runs, runs[0].model.derivative, moved)
+    return [(each - run.rates) * (1.0 / PROBE) for run, each in zip(runs, rates, strict=True)]
 
 
-def _of_another_value(moved: FloatArray, run: DisturbedRun) -> FloatArray:
+def _of_another_value(moved: FloatArray, run: DisturbedRun, rates: Rates) -> FloatArray:
     """Change of the outputs by moved parameters, in the rates and in what is seen of the states."""
     seen, before = (
         observed(run.model, run.states, run.record.inputs, values) for values in (moved, run.vector)
     )
-    return run.added(_followed(moved, run)) + run.logged((seen - before) / _PROBE)
+    return run.added(rates) + run.logged((seen - before) / PROBE)
 
 
 def rest_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
@@ -676,7 +679,7 @@ def rest_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             continue
         for i in physical_equations(runs[0]):
             along = [partial(_while_at_rest, u, j) for j in range(len(model.states))]
-            columns = np.stack([added_rates(runs, i, signal) for signal in along], axis=2)
+            columns = added_rates(runs, i, along)
             name = f"d{model.states[i].name}/dt while {given.name} stands at 0"
             yield Suspect("rest", name, f"{model.states[i].unit}/s", columns, of_input=True)
 
@@ -700,13 +703,12 @@ def _while_at_rest(u: int, j: int, run: DisturbedRun) -> FloatArray:
 def change_suspects(runs: Sequence[DisturbedRun], names: Sequence[str]) -> Iterator[Suspect]:
     """Parameters, by name, that change in proportion to time from a record's begin to its end."""
     for name in names:
-        changes = of_each(runs, partial(_drifting, _with_more(name, runs[0])))
+        changes = of_each(runs, _drifting, followed(runs, _with_more(name, runs[0])))
         yield Suspect("change", name, "1", changes[..., None])
 
 
-def _drifting(moved: FloatArray, run: DisturbedRun) -> FloatArray:
-    """Change by parameters that move by a part of what others differ by, in proportion to time."""
-    rates = _followed(moved, run)
+def _drifting(run: DisturbedRun, rates: Rates) -> FloatArray:
+    """Change by what is added to rates in proportion to time."""
     return run.added(rates * np.linspace(-0.5, 0.5, run.record.n_samples)[:, None])
 
 
@@ -721,8 +723,8 @@ def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     earlier: list[FloatArray] = []
     for place, name in enumerate(model.parameter_names):
         moved = vector.copy()
-        moved[place] += _PROBE * (vector[place] or 1.0)
-        terms = [_followed(moved, run) for run in runs]
+        moved[place] += PROBE * (vector[place] or 1.0)
+        terms = followed(runs, moved)
         whole = np.concatenate([term.after for term in terms])
         if not (np.all(np.isfinite(whole)) and np.any(whole)):
             continue
@@ -736,8 +738,8 @@ def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
             continue
         earlier.append(along)
         size = float(np.abs(along).max())
-        columns = [_bent(runs, terms, main, size, bend) for bend in _BENDS]
-        yield Suspect("bend", name, "1", np.stack(columns, axis=2))
+        bent = [_bent(each, main, size) for each in terms]
+        yield Suspect("bend", name, "1", of_each(runs, DisturbedRun.added, bent))
 
 
 def _alike(values: FloatArray, along: FloatArray) -> bool:
@@ -747,20 +749,13 @@ def _alike(values: FloatArray, along: FloatArray) -> bool:
     return bool(size == 0.0 or (factor != 0.0 and error <= _PROPORTIONAL * size))
 
 
-def _bent(
-    runs: Sequence[DisturbedRun],
-    terms: Sequence[Rates],
-    main: int,
-    size: float,
-    bend: Callable[[FloatArray], FloatArray],
-) -> FloatArray:
-    """Changes by terms of each run times a function of their size."""
+def _bent(terms: Rates, main: int, size: float) -> Rates:
+    """Terms of a run times each of some functions of their size."""
 
-    def sized(term: FloatArray) -> FloatArray:
+    def sized(term: FloatArray, bend: Callable[[FloatArray], FloatArray]) -> FloatArray:
         return term * bend(np.abs(term[:, main]) / size)[:, None]
 
-    added = [Rates(sized(term.after), sized(term.before)) for term in terms]
-    return np.concatenate([run.added(part) for run, part in zip(runs, added, strict=True)])
+    return Rates.together([Rates(sized(terms.after, b), sized(terms.before, b)) for b in _BENDS])
 
 
 def _jumps(signal: FloatArray, limit: float) -> bool:
@@ -777,17 +772,19 @@ def _signal(j: int, run: DisturbedRun) -> FloatArray:
 def added_rates(
     runs: Sequence[DisturbedRun],
     i: int,
-    signal: Callable[[DisturbedRun], FloatArray],
+    signals: Sequence[Callable[[DisturbedRun], FloatArray]],
     *,
     held: bool = False,
 ) -> FloatArray:
-    """Changes by a signal (n_samples,) of each run that is added to equation i.
+    """Changes (n_rows, n_outputs, k) by signals (n_samples,) of each run, one by one in equation i.
 
-    held: whether it stands from each sample to the next.
+    held: whether they stand from each sample to the next.
     """
 
     def change(run: DisturbedRun) -> FloatArray:
-        after = _column(run.states, i, signal(run))
+        after = np.zeros((*run.states.shape, len(signals)))
+        for place, signal in enumerate(signals):
+            after[:, i, place] = signal(run)
         return run.added(Rates(after, delayed(after) if held else after))
 
     return of_each(runs, change)

@@ -12,15 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import FloatArray, IntArray
-from sysid.engine.trace import rates_along
 from sysid.judging.disturbed import DisturbedRun
-from sysid.judging.suspects import SPEEDS, Suspect, added_rates, physical_equations
+from sysid.judging.suspects import (
+    PROBE,
+    SPEEDS,
+    Suspect,
+    added_rates,
+    followed,
+    physical_equations,
+)
 
 # Dry friction in parts of the largest that acts on a speed, and offsets in parts of a channel's
 # largest value, delays in parts of a sample: as is usual.
 _FRICTION, _OFFSET, _DELAY = 0.05, 0.01, 0.1
 _RATHER = 0.1  # part by which a term may differ from friction and still be some
-_PROBE = 1e-3
 _ROUNDED = 0.01  # of a speed's largest, below which the sign of a wrong run is not known
 _POINTS = 50
 
@@ -89,8 +94,8 @@ def _friction(runs: Sequence[DisturbedRun], i: int) -> Possibility:
         sign: FloatArray = -np.tanh(run.states[:, i] / max(rounded, 1e-300))
         return sign
 
-    changes = added_rates(runs, i, braking)
-    suspect = Suspect("function", state.name, f"{state.unit}/s", changes[..., None])
+    changes = added_rates(runs, i, [braking])
+    suspect = Suspect("function", state.name, f"{state.unit}/s", changes)
     low, high = float(speeds.min()), float(speeds.max())
     one_way = low > -_RATHER * high or high < -_RATHER * low
     cure = (
@@ -107,19 +112,11 @@ def _friction(runs: Sequence[DisturbedRun], i: int) -> Possibility:
 
 def _acting(runs: Sequence[DisturbedRun], i: int) -> float:
     """Root mean square of the largest of the terms that parameters have in an equation."""
-    sizes = [0.0]
-    for place in range(len(runs[0].vector)):
-        squares = [_term(run, place)[:, i] ** 2 for run in runs]
-        sizes.append(float(np.sqrt(np.mean(np.concatenate(squares)))))
+    sizes, more = [0.0], np.diag(PROBE * runs[0].vector)
+    for moved in runs[0].vector + more:
+        term = np.concatenate([rates.after[:, i] for rates in followed(runs, moved)])
+        sizes.append(float(np.sqrt(np.mean(term**2))))
     return max(size for size in sizes if np.isfinite(size))
-
-
-def _term(run: DisturbedRun, place: int) -> FloatArray:
-    """What a parameter, by its place, contributes to the rates, were these in proportion to it."""
-    moved = run.vector.copy()
-    moved[place] *= 1.0 + _PROBE
-    rates = rates_along(run.model.derivative, run.states, run.record.inputs, moved)
-    return (rates - run.rates.after) / _PROBE
 
 
 def _rubs(runs: Sequence[DisturbedRun], i: int) -> bool:
@@ -130,7 +127,7 @@ def _rubs(runs: Sequence[DisturbedRun], i: int) -> bool:
     rows = fast[np.unique(np.linspace(0, len(fast) - 1, _POINTS).astype(np.int64))]
     for place in np.flatnonzero(run.vector).tolist():
         moved = run.vector.copy()
-        moved[place] *= 1.0 + _PROBE
+        moved[place] *= 1.0 + PROBE
         along, faster, back = (
             _rate(run, rows, i, factor, moved) - _rate(run, rows, i, factor, run.vector)
             for factor in (1.0, 2.0, -1.0)
@@ -165,9 +162,9 @@ def _as_input(run: DisturbedRun, i: int) -> tuple[float, str]:
         if span == 0.0:
             continue
         moved = np.zeros_like(run.record.inputs)
-        moved[:, k] = _PROBE * span
-        slopes = (run.rates_by(moved) - run.rates.after)[:, i] / (_PROBE * span)
+        moved[:, k] = PROBE * span
+        slopes = (run.rates_by(moved) - run.rates.after)[:, i] / (PROBE * span)
         size = float(np.abs(slopes).max())
-        if size > 0.0 and float(np.ptp(slopes)) < _PROBE * size:
+        if size > 0.0 and float(np.ptp(slopes)) < PROBE * size:
             return 1.0 / size, given.unit
     return 1.0, f"{state.unit}/s"

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from numba import njit
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.uncertainty.colour import Autoregression, colour, fast_colour, record_rows
@@ -112,9 +112,7 @@ class Whitener:
         fast = np.array(columns[..., felt], order="C")
         for j, kalman in self.filters.items():
             fast[:, j] = kalman.innovations(fast[:, j], rows)
-        flat = fast.reshape(len(columns) * q, -1)
-        past = sliding_window_view(flat, (order + 1) * q, axis=0)[::q].swapaxes(1, 2)
-        white: FloatArray = (self._filter @ past)[self.kept[rows][order:]]
+        white: FloatArray = _filtered(self._filter, fast)[self.kept[rows][order:]]
         whole[:, felt] = white.reshape(len(whole), -1)
         return whole
 
@@ -141,6 +139,24 @@ class Whitener:
         first = int(self.kept[: rows.start].sum())
         count = int(self.kept[rows].sum())
         return slice(self.n_outputs * first, self.n_outputs * (first + count))
+
+
+@njit(cache=True, nogil=True)
+def _filtered(weights: FloatArray, columns: FloatArray) -> FloatArray:
+    """Columns (n, q, k) of which each sample is made of it and those before, (n - order, q, k).
+
+    weights: (q, (order + 1) q), the oldest first.
+    """
+    n, q, count = columns.shape
+    size = weights.shape[1]
+    flat = columns.reshape(n * q, count)
+    white = np.zeros((max(n - size // q + 1, 0), q, count))
+    for t in range(len(white)):
+        for j in range(q):
+            for i in range(size):
+                for c in range(count):
+                    white[t, j, c] += weights[j, i] * flat[t * q + i, c]
+    return white
 
 
 def colour_about_line(

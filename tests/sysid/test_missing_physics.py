@@ -29,7 +29,7 @@ from benchmarks.stress import fitted, tried
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.examples import lag
 from sysid.gassi import GASSI
-from sysid.judging.disturbed import DisturbedRun, Rates
+from sysid.judging.disturbed import DisturbedRun, Rates, rates_of_each
 from sysid.judging.examination import score_tests_of, suspected, verdict_of
 from sysid.judging.suspects import channel_suspects
 from sysid.judging.whitener import colour_about_line
@@ -380,10 +380,15 @@ def test_what_is_added_to_an_equation_moves_outputs_as_a_model_with_it_would():
 def test_rates_along_a_run_are_those_at_each_of_its_points(derivative):
     (training,), _ = CASES["motor"].records(0)
     vector = np.array([TRUTH[name] for name in MODEL.parameter_names])
-    run = DisturbedRun.free(MODEL, vector, training, np.zeros(2), 4, Workers(1))
-    points = zip(run.states, training.inputs, strict=True)
-    expected = [derivative(tuple(x), tuple(u), tuple(vector)) for x, u in points]
-    np.testing.assert_allclose(run.rates_of(derivative, vector).after, expected, rtol=1e-12)
+    records = [training, training.part(100, 180, "part")]
+    runs = [DisturbedRun.free(MODEL, vector, r, np.zeros(2), 4, Workers(1)) for r in records]
+    for run, rates in zip(runs, rates_of_each(runs, derivative, vector), strict=True):
+        points = zip(run.states, run.record.inputs, strict=True)
+        expected = [derivative(tuple(x), tuple(u), tuple(vector)) for x, u in points]
+        np.testing.assert_allclose(rates.after, expected, rtol=1e-12)
+        once = run.added(rates)
+        twice = run.added(Rates.together([rates, rates * 2.0]))
+        np.testing.assert_allclose(twice, np.stack([once, 2.0 * once], axis=2), rtol=1e-12)
 
 
 def slow_input(seed, late=0):
