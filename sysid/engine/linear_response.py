@@ -125,27 +125,26 @@ def changes_along(
     n_outputs, k). Copied in loops: assignments of whole arrays take the compiler three seconds.
     """
     n, q, m = rows.shape
-    count = added.shape[2]
-    changes = np.empty((n, q, count))
-    d, moved = first.copy(), np.empty((m, count))
-    for k in range(n):
-        for j in range(q):
-            for c in range(count):
-                changes[k, j, c] = added[k, j, c]
-            for a in range(m):
-                for c in range(count):
-                    changes[k, j, c] += rows[k, j, a] * d[a, c]
-            for a in range(m):
-                for c in range(count):
-                    d[a, c] -= gains[k, j, a] * changes[k, j, c]
+    changes = np.empty(added.shape)
+    d, moved = np.empty(m), np.empty(m)
+    for c in range(added.shape[2]):
         for a in range(m):
-            for c in range(count):
-                moved[a, c] = pushes[k, a, c]
-        for b in range(m):
+            d[a] = first[a, c]
+        for k in range(n):
+            for j in range(q):
+                e = added[k, j, c]
+                for a in range(m):
+                    e += rows[k, j, a] * d[a]
+                for a in range(m):
+                    d[a] -= gains[k, j, a] * e
+                changes[k, j, c] = e
             for a in range(m):
-                for c in range(count):
-                    moved[a, c] += onward[k, b, a] * d[b, c]
-        d, moved = moved, d
+                moved[a] = pushes[k, a, c]
+            for b in range(m):
+                for a in range(m):
+                    moved[a] += onward[k, b, a] * d[b]
+            for a in range(m):
+                d[a] = moved[a]
     return changes
 
 
