@@ -32,7 +32,7 @@ from sysid.judging.lags import lag_faults
 from sysid.judging.plausibility import implausible, start_faults
 from sysid.problem.copies import shared_samples
 from sysid.problem.data import require_information
-from sysid.problem.faults import DataFault, Part, after_mending, data_faults
+from sysid.problem.faults import DataFault, Part, after_explaining, after_mending, data_faults
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -368,6 +368,8 @@ def assemble(
         watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
     training, validation = ([_fitted(log, estimator, uncertainty) for log in part] for part in logs)
     faults = faults_of(problem, logs) if faults is None else faults
+    runs = [(fitted.log.dataset, fitted.run) for fitted in training]
+    faults = after_explaining(faults, problem.model, "training", runs)
     parts = profiles, training, validation, folder
     return Identification(problem, estimator, uncertainty, *parts, faults=faults)
 

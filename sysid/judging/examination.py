@@ -21,7 +21,7 @@ from sysid.judging.latencies import with_latencies
 from sysid.judging.score_tests import ScoreTests, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
-from sysid.problem.faults import data_faults
+from sysid.problem.faults import after_explaining, data_faults
 from sysid.problem.model import ModelError, Parameter, ProcessModel
 from sysid.threads import one_thread
 from sysid.uncertainty import Uncertainty
@@ -64,6 +64,7 @@ def verdict_of(
         for part in (training, validation)
     )
     runs = [run for run, _ in trained]
+    faults = data_faults(estimator.simulator().model, training, validation)
     suspicion = suspected(estimator, uncertainty, training, validation, runs=runs)
     return judge(
         estimator.simulator().model,
@@ -73,7 +74,12 @@ def verdict_of(
         estimator.feasible_,
         faults=(
             *lag_faults(estimator.simulator().model, training),
-            *data_faults(estimator.simulator().model, training, validation),
+            *after_explaining(
+                faults,
+                estimator.simulator().model,
+                "training",
+                list(zip(training, runs, strict=True)),
+            ),
         ),
         findings=None if suspicion is None else suspicion.findings,
         alternative=None if suspicion is None else suspicion.alternative,

@@ -40,6 +40,7 @@ _ENOUGH = 0.3  # of a record, that is worth to be fitted by itself
 _GROSS = 5.0  # of a command's deviation, beyond which a single value is no command
 _IN_VALIDATION = "no parameter comes of it, but errors in validation do"
 _LEFT_OUT = "as 'robust: true' has it, these samples count as not measured"
+_ACCOUNTED = 0.5  # of how far a sample stands off, that a model may leave to explain it
 _COARSE = 16  # steps in a channel's span, below which they are seen in the parameters
 
 
@@ -143,6 +144,43 @@ def after_mending(faults: Sequence[DataFault], model: ProcessModel) -> tuple[Dat
         else fault
         for fault in faults
     )
+
+
+def after_explaining(
+    faults: Sequence[DataFault],
+    model: ProcessModel,
+    part: Part,
+    runs: Sequence[tuple[Dataset, FloatArray]],
+) -> tuple[DataFault, ...]:
+    """Faults without outputs' samples that stand off their neighbours, where a model's do as well.
+
+    As a current at which a shaft is stopped. runs: records of a part, and free runs of the model on
+    them, (n_samples, n_outputs).
+    """
+    return tuple(
+        fault
+        for fault in faults
+        if (fault.kind, fault.part) != ("outliers", part)
+        or fault.channel not in model.output_names
+        or not all(
+            _explains(record, run, model.output_names.index(fault.channel))
+            for record, run in runs
+            if record.name in fault.records
+        )
+    )
+
+
+def _explains(record: Dataset, run: FloatArray, output: int) -> bool:
+    """Whether of each sample that stands off a run leaves less than half of that."""
+    values = record.outputs[:, output]
+    jolts = spikes(values, record.inputs, _averaged(record, output))
+    if jolts is None:  # none are left in it
+        return False
+    off, left = (
+        np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))[jolts.at[1:-1]]
+        for signal in (values, values - run[:, output])
+    )
+    return bool(np.all(left < _ACCOUNTED * off))
 
 
 def _merged(faults: Sequence[DataFault]) -> list[DataFault]:

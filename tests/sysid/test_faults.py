@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from sysid import Dataset, Input, Output, ProcessModel, SearchSpace, State
 from sysid.judging.plausibility import implausible, start_faults
-from sysid.problem.faults import after_mending, data_faults, mended
+from sysid.problem.faults import after_explaining, after_mending, data_faults, mended
 from tests.sysid.support import lag
 
 DT = 0.01
@@ -340,6 +340,20 @@ def test_a_gain_near_the_ends_of_its_range_is_no_unit(gain):
 def test_an_output_of_nothing_but_noise_is_no_unit():
     quiet = Dataset(np.zeros(N), 5.0 * np.random.default_rng(0).standard_normal(N), DT)
     assert implausible(model(), SearchSpace.of(model()), [quiet]) == ()
+
+
+@pytest.mark.parametrize(("explained", "left"), [(2, 0), (1, 1), (0, 1)])
+def test_samples_that_stand_off_in_the_model_as_well_are_no_outliers(explained, left):
+    exact, places = driven(levels(), noise=0.0), [150, 450]
+    jolts = np.zeros((N, 1))
+    jolts[places] = 0.8
+    record = replace(exact, outputs=driven(levels()).outputs + jolts)
+    faults = data_faults(model(), [record])
+    assert [fault.kind for fault in faults] == ["outliers"]
+    jolts[places[explained:]] = 0.0
+    runs = [(record, exact.outputs + 0.8 * jolts)]
+    assert len(after_explaining(faults, model(), "training", runs)) == left
+    assert after_explaining(faults, model(), "validation", runs) == faults
 
 
 def test_outliers_of_a_measured_input_are_named_and_mended():
