@@ -13,6 +13,7 @@ their change multiplies innovations, which are zero in the mean.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -71,8 +72,8 @@ class LinearResponse:
         just after each sample. Behind the model's states and outputs stand integrals of those that
         are averaged, which may be left out.
         """
-        several = rates is not None and rates.ndim == 3
-        count = rates.shape[2] if rates is not None and several else 1
+        several = () if rates is None else rates.shape[2:]
+        count = math.prod(several)
         n, q, m = self.rows.shape
         pushes, first = np.zeros((n, m, count)), np.zeros((m, count))
         if rates is not None or inputs is not None:

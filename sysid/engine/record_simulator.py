@@ -339,12 +339,10 @@ class RecordSimulator:
             tangents.simulate(
                 work, work.reshape(-1, LANES), kernel.tables, self._driving, *self._unmeasured,
                 np.ascontiguousarray(starts[padded].T), np.ascontiguousarray(parameters[padded].T),
-                self.record.dt / self._parts, -(-n_steps // self._parts),
-                np.empty((2 * kernel.n_outputs, LANES)), fine,
+                *self._pace(n_steps, self._parts), np.empty((2 * kernel.n_outputs, LANES)), fine,
             )  # fmt: skip
         kept = np.ascontiguousarray(fine[:: self._parts])
-        for i, j in enumerate(self.averaged):
-            kept[:, j] = average(kept[:, j], kept[:, q + i] / self.record.dt, self._windows[j])
+        self._average(kept, [integral / self.record.dt for integral in kept[:, q:].swapaxes(0, 1)])
         return kept[:, :q, :n]
 
     def block(
@@ -367,16 +365,24 @@ class RecordSimulator:
         rows = self._rows(n_samples)
         residuals = np.empty((rows if keep else 0, self._measured.shape[1], LANES))
         run = tuple(part[:rows] for part in (self._driving, *self._compared))
-        start, dt = self._initial(starts, lanes), self.record.dt / self._parts
-        steps = -(-n_steps // self._parts)
+        start, pace = self._initial(starts, lanes), self._pace(n_steps, self._parts)
         sums, estimates, _ = self._run(
-            self.kernels, parameters, start, lanes, dt, steps, run, residuals
+            self.kernels, parameters, start, lanes, *pace, run, residuals
         )
         return sums, estimates, residuals[:: self._parts]
 
     def _rows(self, n_samples: int) -> int:
         """Rows of what drives so many samples, parts between them included."""
         return (n_samples - 1) * self._parts + 1
+
+    def _pace(self, n_steps: int, parts: int) -> tuple[float, int]:
+        """Time of a part of a sample, and integration steps in it, by those in a sample."""
+        return self.record.dt / parts, -(-n_steps // parts)
+
+    def _average(self, outputs: FloatArray, integrals: Sequence[FloatArray]) -> None:
+        """Put means over windows in place of averaged outputs, by integrals."""
+        for j, integral in zip(self.averaged, integrals, strict=True):
+            outputs[:, j] = average(outputs[:, j], integral, self._windows[j, : len(outputs)])
 
     def _means(self, averaged: Sequence[int], corrects: bool) -> _Means:
         """Weights (n_samples, n_outputs, 2, 4) as of ``weights_of_sums`` for a filter.
@@ -439,8 +445,7 @@ class RecordSimulator:
             outputs, integrals, _ = self._integrated(
                 parameters, starts, lanes, n_steps, self.record.n_samples, by_means=by_means
             )
-            for j, integral in zip(self.averaged, integrals, strict=True):
-                outputs[:, j] = average(outputs[:, j], integral, self._windows[j])
+            self._average(outputs, integrals)
             runs.append(outputs)
         beyond: FloatArray = runs[0] - runs[1]
         return beyond
@@ -465,7 +470,7 @@ class RecordSimulator:
             if self._parts == 1:
                 inputs = in_parts(self.kernels.model, self._inputs, _PARTS)
             self._in_parts = inputs, ends
-        (inputs, ends), dt, steps = self._in_parts, self.record.dt / _PARTS, -(-n_steps // _PARTS)
+        (inputs, ends), (dt, steps) = self._in_parts, self._pace(n_steps, _PARTS)
         state = self._integrating_start(starts, lanes)
         q = self._measured.shape[1]
         kept = np.empty((_AT_ONCE * _PARTS + 1, q + len(self.averaged), LANES))
@@ -501,13 +506,11 @@ class RecordSimulator:
         inputs = self._inputs if by_means else self._driving
         q, more, rows = self._measured.shape[1], len(self.averaged), (n_samples - 1) * parts + 1
         fine = np.empty((rows, q + more, LANES))
-        start, dt = self._integrating_start(starts, lanes), self.record.dt
+        start, pace = self._integrating_start(starts, lanes), self._pace(n_steps, parts)
         run = tuple(part[:rows] for part in (inputs, *self._unmeasured))
-        _, estimates, _ = self._run(
-            self._integrating, parameters, start, lanes, dt / parts, -(-n_steps // parts), run, fine
-        )
+        _, estimates, _ = self._run(self._integrating, parameters, start, lanes, *pace, run, fine)
         kept = fine[::parts]
-        integrals = [kept[:, q + i] / dt for i in range(more)]
+        integrals = [kept[:, q + i] / self.record.dt for i in range(more)]
         return kept[:, :q], integrals, estimates[:, :q]
 
     def _integrating_start(self, starts: FloatArray | None, lanes: IntArray) -> FloatArray:
@@ -527,8 +530,7 @@ class RecordSimulator:
         outputs, integrals, estimates = self._integrated(
             parameters, starts, lanes, n_steps, n_samples
         )
-        for j, integral in zip(self.averaged, integrals, strict=True):
-            outputs[:, j] = average(outputs[:, j], integral, self._windows[j, :n_samples])
+        self._average(outputs, integrals)
         sums = compared(outputs, self._measured[:n_samples], self._weights[:n_samples])
         return sums.T[: len(lanes)], estimates, outputs
 

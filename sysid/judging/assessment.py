@@ -16,7 +16,7 @@ from scipy.special import fdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.alternatives import Alternative
-from sysid.judging.evidence import independent_samples
+from sysid.judging.evidence import independent_of_each
 from sysid.judging.expected_errors import ExpectedErrors, FloorTest, floor_test
 from sysid.judging.findings import MOVED, Finding, Unseen, description
 from sysid.judging.phrases import change, sized
@@ -146,6 +146,8 @@ def examine(
     residual, finite = record.outputs - simulated, bool(np.all(np.isfinite(simulated)))
     systematic = None if expected is None else expected.systematic
     evened = residual if expected is None else expected.evened(residual)
+    exact = None if expected is None else expected.of_exact_parameters
+    independent = independent_of_each(residual)
     shared = by_speed = None
     alone = errors_alone(evened, record.outputs) if finite else None
     if alone is not None and record.jitter.size:
@@ -163,9 +165,9 @@ def examine(
         residual_test(
             residual, record.inputs, record.input_noise, systematic=systematic, later=later
         ),
-        np.array([independent_samples([e[np.isfinite(e), None]]) for e in residual.T]),
-        None if expected is None else floor_test(residual, expected),
-        None if expected is None else floor_test(residual, expected.of_exact_parameters),
+        independent,
+        None if expected is None else floor_test(residual, expected, independent),
+        None if exact is None else floor_test(residual, exact, independent),
         starts,
         shared,
         by_speed,

@@ -144,7 +144,7 @@ class DisturbedRun:
         instants = observed(self.model, self.states, self.record.inputs, self.vector)
         return self._as_measured(np.hstack([instants, integrals]), windows)
 
-    @property
+    @cached_property
     def inputs_before(self) -> FloatArray:
         """Inputs just before each sample, (n_samples, n_inputs)."""
         inputs, held = self.record.inputs, [given.hold == "zoh" for given in self.model.inputs]

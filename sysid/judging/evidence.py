@@ -90,6 +90,14 @@ def independent_samples(residuals: Sequence[FloatArray]) -> float:
     return n * q / total
 
 
+def independent_of_each(residual: FloatArray) -> FloatArray:
+    """As of ``independent_samples``, of each output's residuals (n_samples, n_outputs) alone.
+
+    NaN where a sample was lost.
+    """
+    return np.array([independent_samples([e[np.isfinite(e), None]]) for e in residual.T])
+
+
 def _squares(series: Sequence[FloatArray], lag: int, n: int) -> float:
     products = [part[lag:].T @ part[: len(part) - lag] for part in series if len(part) > lag]
     return float(np.sum((np.sum(products, axis=0) / n) ** 2)) if products else 0.0

@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from sysid.arrays import BoolArray, FloatArray
 from sysid.engine.simulation import BatchSimulator
 from sysid.fitting.means import Run, each_mean_once, scatter
-from sysid.judging.evidence import independent_samples
+from sysid.judging.evidence import independent_of_each
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
@@ -204,8 +204,12 @@ def _by_input_noise(
     return squares, each
 
 
-def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
+def floor_test(
+    residual: FloatArray, expected: ExpectedErrors, independent: FloatArray | None = None
+) -> FloorTest:
     """Chi-square tests of residuals (n_samples, n_outputs), NaN where a sample was lost.
+
+    independent: (n_outputs,), as of ``independent_of_each``, where they have been counted.
 
     >>> rng = np.random.default_rng(0)
     >>> noise = rng.standard_normal((1000, 2)) * [1.0, 3.0]
@@ -216,12 +220,13 @@ def floor_test(residual: FloatArray, expected: ExpectedErrors) -> FloorTest:
     ([1.0, 3.0], [False, True])
     """
     variance, most = expected.variance, expected.freedom
+    counts = independent_of_each(residual) if independent is None else independent
     ratio, p_value = np.full(len(variance), np.nan), np.full(len(variance), np.nan)
     for j in np.flatnonzero(variance > 0.0):
-        measured = residual[np.isfinite(residual[:, j]), j : j + 1]
+        measured = residual[np.isfinite(residual[:, j]), j]
         if len(measured) < 2:
             continue
         square = float(np.mean(measured**2)) / float(variance[j])
-        freedom = min(independent_samples([measured]), float(most[j]))
+        freedom = min(float(counts[j]), float(most[j]))
         ratio[j], p_value[j] = np.sqrt(square), chdtrc(freedom, square * freedom)
     return FloorTest(ratio, p_value)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from sysid.judging.phrases import either, sized
 from sysid.judging.suspects import Kind
+from sysid.problem.model import ProcessModel
 from sysid.problem.terms import AddedTerm
 from sysid.uncertainty import Estimate
 
@@ -24,6 +25,11 @@ class Move:
     quantity: Estimate
     change: float
     deviations: float
+
+
+def is_of_parameters(quantity: Estimate, model: ProcessModel) -> bool:
+    """Whether a quantity is of the model's parameters, and no start of a state."""
+    return quantity.combination is not None or quantity.name in model.parameter_names
 
 
 def moves_of(estimates: Iterable[Estimate], changes: Iterable[float]) -> tuple[Move, ...]:

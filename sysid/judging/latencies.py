@@ -20,7 +20,7 @@ from sysid.arrays import FloatArray
 from sysid.fitting.objective import Objective
 from sysid.fitting.refinement import refine
 from sysid.judging.alternatives import shared
-from sysid.judging.findings import Finding, moves_of
+from sysid.judging.findings import Finding, is_of_parameters, moves_of
 from sysid.judging.score_tests import missing_physics
 from sysid.problem.data import Dataset
 from sysid.problem.model import ModelError, ProcessModel
@@ -88,8 +88,8 @@ def _finding(here: _Moved, late: _Moved, name: str, uncertainty: Uncertainty) ->
     names = late.objective.space.names
     parameters = dict(zip(names, late.chromosome.tolist(), strict=True))
     # Where records start has moved as well, and is nobody's parameter.
-    of_model = {*late.objective.simulator.model.parameter_names}
-    estimates = [e for e in shared(uncertainty, parameters) if e.combination or e.name in of_model]
+    model = late.objective.simulator.model
+    estimates = [e for e in shared(uncertainty, parameters) if is_of_parameters(e, model)]
     moves = moves_of(estimates, [e.at(parameters) - e.value for e in estimates])
     chance = float(chdtrc(1, here.deviance - late.deviance))
     share = 1.0 - float(np.mean((late.rms / here.rms) ** 2))

@@ -11,7 +11,7 @@ from scipy.special import bdtrc
 
 from sysid.arrays import BoolArray, FloatArray
 from sysid.judging.residual_tests import residual_test
-from sysid.problem.channels import MEDIAN_OF_NORMAL, resolution
+from sysid.problem.channels import MEDIAN_OF_NORMAL, off_neighbours, resolution
 from sysid.uncertainty.estimate import Z95
 
 _LAGS = 20  # at which two outputs' residuals are compared
@@ -86,8 +86,7 @@ def errors_alone(residual: FloatArray, outputs: FloatArray) -> FloatArray:
     [0.0, 0.04]
     """
     n, share = len(residual), np.zeros(residual.shape[1])
-    apart = np.zeros_like(residual)
-    apart[1:-1] = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
+    apart = off_neighbours(residual)
     sizes = np.abs(np.where(np.isfinite(apart), apart, 0.0))
     for j in np.flatnonzero(sizes.any(axis=0)):
         size = sizes[:, j]

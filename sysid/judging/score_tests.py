@@ -33,7 +33,15 @@ from sysid.judging.background import Background, of_filter, of_free_runs, quiet_
 from sysid.judging.cycles import cycle_suspects
 from sysid.judging.disturbed import DisturbedRun
 from sysid.judging.feedback import answer_probability, answers
-from sysid.judging.findings import MOVED, Finding, Missing, Move, Unseen, moves_of
+from sysid.judging.findings import (
+    MOVED,
+    Finding,
+    Missing,
+    Move,
+    Unseen,
+    is_of_parameters,
+    moves_of,
+)
 from sysid.judging.phrases import sized
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
@@ -276,11 +284,6 @@ class _Tests:
             farthest |= {n: max(size, farthest.get(n, 0.0)) for n, size in sizes.items()}
         return tuple(chosen)
 
-    def _is_asked(self, quantity: Estimate) -> bool:
-        """Whether it is of the model's parameters, and no start of a state."""
-        names = self._local.objective.simulator.model.parameter_names
-        return quantity.combination is not None or quantity.name in names
-
     def _unseen(self, possibility: Possibility) -> Unseen | None:
         """What a possibility would move while it is not seen; None of what a parameter does."""
         changes = possibility.suspect.changes / self._scales[..., None]
@@ -292,7 +295,8 @@ class _Tests:
         amplitude = min(possibility.usual, _SEEN * self._regression.deviation(changes))
         moved = self._moved_by(amplitude * changes[..., 0])
         every = map(self._within_limits, moves_of(self._estimates, moved.tolist()))
-        moves = tuple(move for move in every if self._is_asked(move.quantity))
+        model = self._local.objective.simulator.model
+        moves = tuple(move for move in every if is_of_parameters(move.quantity, model))
         size = sized(amplitude * possibility.size, possibility.unit, 2)
         return Unseen(possibility.words.format(size=size), moves, possibility.cure)
 

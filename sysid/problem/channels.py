@@ -161,6 +161,13 @@ def resolution(values: FloatArray) -> float:
     return float(gaps.min()) if len(gaps) else 0.0
 
 
+def off_neighbours(values: FloatArray) -> FloatArray:
+    """How far each sample is from the mean of its neighbours, (n, ...), zero at both ends."""
+    off = np.zeros_like(values)
+    off[1:-1] = values[1:-1] - 0.5 * (values[:-2] + values[2:])
+    return off
+
+
 def spikes(values: FloatArray, inputs: FloatArray, averaged: FloatArray) -> Spikes | None:
     """Single samples that leave their neighbours and return, too far for noise, or a sharp corner.
 
@@ -176,7 +183,7 @@ def spikes(values: FloatArray, inputs: FloatArray, averaged: FloatArray) -> Spik
     """
     n = len(values)
     before, middle, after = values[:-2], values[1:-1], values[2:]
-    away = middle - 0.5 * (before + after)
+    away = off_neighbours(values)[1:-1]
     returned = np.abs(after - before) < 0.3 * np.minimum(
         np.abs(middle - before), np.abs(middle - after)
     )

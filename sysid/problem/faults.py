@@ -8,7 +8,14 @@ from typing import Literal
 import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
-from sysid.problem.channels import coarse_steps, noise, pile_ups, spikes, standstill
+from sysid.problem.channels import (
+    coarse_steps,
+    noise,
+    off_neighbours,
+    pile_ups,
+    spikes,
+    standstill,
+)
 from sysid.problem.copies import shared_samples
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, Output, ProcessModel
@@ -177,8 +184,7 @@ def _explains(record: Dataset, run: FloatArray, output: int) -> bool:
     if jolts is None:  # none are left in it
         return False
     off, left = (
-        np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))[jolts.at[1:-1]]
-        for signal in (values, values - run[:, output])
+        np.abs(off_neighbours(signal))[jolts.at] for signal in (values, values - run[:, output])
     )
     return bool(np.all(left < _ACCOUNTED * off))
 

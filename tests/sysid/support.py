@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 
@@ -159,6 +160,22 @@ def draw(model, rng, n):
 def prbs(rng, n, low, high, hold=8):
     """Random levels, each held for a while."""
     return np.repeat(rng.uniform(low, high, -(-n // hold)), hold)[:n]
+
+
+def held_lag(u, samples, gain, tau, parts=1):
+    """Exact outputs of a lag from rest to what is held so many samples earlier.
+
+    tau: in samples. Parts of samples apart, to the last sample of u.
+    """
+    n = len(u)
+    grid = np.arange((n - 1) * parts + 1) / parts
+    changes = np.arange(-n, 2 * n) - samples
+    times = np.unique([*grid, *changes[(changes > 0.0) & (changes < n - 1.0)]])
+    values = [0.0]
+    for begin, end in itertools.pairwise(times):
+        held = gain * u[np.clip(int(np.floor(0.5 * (begin + end) + samples)), 0, n - 1)]
+        values.append(held + (values[-1] - held) * np.exp(-(end - begin) / tau))
+    return np.array(values)[np.searchsorted(times, grid)]
 
 
 def normalised_rms(simulated, exact):

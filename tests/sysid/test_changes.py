@@ -1,6 +1,5 @@
 """Held inputs that change between samples: a delay of parts of a sample, as drivers have it."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from sysid.engine.filter_settings import FilterSettings
 from sysid.examples import lag
 from sysid.gassi import GASSI
 from sysid.problem.preparation import Preparation, prepare
+from tests.sysid.support import held_lag
 
 DT, GAIN, TAU = 0.01, 2.0, 0.006  # s: a fifth is left of a step a sample later
 N, PARTS = 60, 40
@@ -20,15 +20,7 @@ P = np.array([[GAIN, TAU]])
 
 
 def answer(u, shift, parts=1):
-    """The lag's outputs, parts of samples apart, to what is held so many samples earlier."""
-    grid = np.arange((N - 1) * parts + 1) / parts
-    changes = np.arange(-N, 2 * N) - shift
-    times = np.unique([*grid, *changes[(changes > 0.0) & (changes < N - 1.0)]])
-    values = [0.0]
-    for begin, end in itertools.pairwise(times):
-        held = GAIN * u[np.clip(int(np.floor(0.5 * (begin + end) + shift)), 0, N - 1)]
-        values.append(held + (values[-1] - held) * np.exp(-(end - begin) * DT / TAU))
-    return np.array(values)[np.searchsorted(times, grid)]
+    return held_lag(u, shift, GAIN, TAU / DT, parts)
 
 
 def levels(seed):

@@ -9,6 +9,7 @@ from sysid.judging.disturbed import DisturbedRun, Rates, delayed
 from sysid.judging.examination import suspected, verdict_of
 from sysid.threads import Workers
 from tests.soak import mostly_soak
+from tests.sysid.support import held_lag
 
 RATE, GAIN, DT = 3.0, 6.0, 0.01
 LAG = ProcessModel(
@@ -94,15 +95,7 @@ def test_what_a_held_input_has_done_before_or_after_is_what_fast_states_keep_of_
     pole = np.exp(-rate * DT)
 
     def response(shift):
-        """By halves of each sample, the first of what is held at its begin."""
-        whole, part = int(np.floor(shift)), shift - np.floor(shift)
-        x, y = 0.0, np.zeros(n)
-        for k in range(n):
-            y[k] = x
-            for value, width in ((k + whole, 1.0 - part), (k + whole + 1, part)):
-                onward = np.exp(-rate * DT * width)
-                x = onward * x + (1.0 - onward) * u[np.clip(value, 0, n - 1)]
-        return y
+        return held_lag(u, shift, 1.0, 1.0 / (rate * DT))
 
     record = Dataset(u, response(0.0), DT)
     run = DisturbedRun.free(LAG, np.array([rate, rate]), record, np.zeros(1), 4, Workers(1))

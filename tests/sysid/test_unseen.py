@@ -9,6 +9,7 @@ from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.gassi import GASSI
 from sysid.judging.examination import verdict_of
 from tests.soak import mostly_soak
+from tests.sysid.support import held_lag
 
 INERTIA, VISCOUS, DRY, DT, N = 0.02, 0.006, 0.03, 0.01, 1500
 INERTIA_RANGE = Parameter("J", "kg*m^2", 0.034, 0.002, 0.2, "log")
@@ -99,13 +100,8 @@ def switched(seed, place, late, crosstalk=0.0, n=2000, dt=1e-3):
     rng = np.random.default_rng([seed, place])
     lengths = rng.integers(10, 60, n // 10)
     levels = np.repeat(rng.uniform(-12.0, 12.0, len(lengths)), lengths)[:n]
-    x, before, i = 0.0, 0.0, np.empty(n)
-    for k in range(n):
-        i[k] = x
-        for volt, part in ((before, late), (levels[k], 1.0 - late)):
-            pole = np.exp(-2.3 / 1.1e-3 * part * dt)
-            x = pole * x + (1.0 - pole) * volt / 2.3
-        before = levels[k]
+    # Nothing acts before the first of them.
+    i = held_lag(np.append(0.0, levels), -late, 1.0 / 2.3, 1.1e-3 / 2.3 / dt)[1:]
     i += crosstalk * levels + 0.02 * rng.standard_normal(n)
     return Dataset(levels, i, dt, f"place {place}")
 
