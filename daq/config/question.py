@@ -52,7 +52,12 @@ class Question(Section):
     run: Seconds | None = Field(
         None, gt=0.0, le=600.0, description="length of a run; default 1.25 s, or the time if less"
     )
-    sample_rate: Hertz = Field(800.0, gt=0.0, le=1e6, description="samples per second")
+    sample_rate: Hertz = Field(
+        2000.0,
+        gt=0.0,
+        le=1e6,
+        description="samples per second; rig characterise takes fewer where the device is slower",
+    )
     calibration: int = Field(
         3200, ge=1, le=1_000_000, description="samples of the offset calibration before each run"
     )

@@ -153,7 +153,8 @@ def _aliases(modes: _Modes, dt: float) -> list[FloatArray]:
     """Chromosomes with the mode at the frequencies that sampling does not tell from its own."""
     mode = modes.mode
     frequencies = _aliased(mode.imag, dt)
-    if mode.imag * dt < 2.0 * np.pi * _FASTEST_SEEN or not len(frequencies):
+    slow = mode.imag * dt < 2.0 * np.pi * _FASTEST_SEEN
+    if slow or not len(frequencies) or not len(modes.acting):
         return []
     at, values = modes.here(len(frequencies))
     for stage in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:

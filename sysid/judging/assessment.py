@@ -47,9 +47,7 @@ _MOSTLY = 0.3  # above which it is no noise at all
 _MUCH, _WANDERS = 0.025, 0.25
 # Share of them inside it, and fit [%], from where on a poor fit may be for a sensor's noise alone.
 _WHITE, _SOMETHING = 0.9, 10.0
-# Residuals in parts of what is to be expected of a right model, above which there is more in them
-# than noise, and the probability below which it is not by chance.
-_ABOVE_NOISE, _BY_CHANCE = 1.25, 0.01
+_BY_CHANCE = 0.01  # probability below which something is not by chance
 # Correlation of two outputs' residuals that is no sensor's; rank correlation of their size with an
 # output's rate of change; how far apart parameters of parts of the data are, in parts of chance.
 _SHARED, _BY_SPEED, _DISAGREEING = 0.3, 0.2, 1.5
@@ -89,6 +87,12 @@ class RecordResult:
     def __repr__(self) -> str:
         fits = ", ".join(f"{fit:.1f}" for fit in self.metrics.fit)
         return f"<RecordResult: {self.name}, fit {fits} %>"
+
+    @property
+    def is_above_floor(self) -> bool:
+        """Whether an output errs by more than a right model would, were this the only record."""
+        tests = [test for test in (self.floor, self.noise) if test is not None]
+        return any(test.above(_BY_CHANCE).any() for test in tests)
 
 
 @dataclass(frozen=True)
@@ -420,8 +424,7 @@ def _above(results: Sequence[RecordResult], tests: Sequence[FloorTest | None]) -
     above = np.zeros(len(results[0].metrics.rmse), dtype=bool)
     limit = _BY_CHANCE / len(results)
     for test in (test for test in tests if test is not None):
-        with np.errstate(invalid="ignore"):
-            above |= (test.ratio > _ABOVE_NOISE) & (test.p_value < limit)
+        above |= test.above(limit)
     return above
 
 

@@ -2,9 +2,10 @@
 
 Noise of the outputs, as a calibration found it; noise of measured inputs, simulated through the
 plant; what the parameters' own uncertainty makes of a free run, the noise of the samples that it
-starts at, and the error of its simulation.
+starts at, errors of the channels' zeros, and the error of its simulation.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -18,7 +19,10 @@ from sysid.judging.evidence import independent_of_each
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
 
-_DRAWS = 40  # realisations of the inputs' noise: they give a variance to within 22 %
+# Realisations of the inputs' noise. They give a variance to within 22 %, and to within 6 % where a
+# test is to say that errors are larger.
+_DRAWS, _MANY = 40, 640
+_ABOVE = 1.25  # of root mean squares in parts of those expected, less than which is let pass
 _STEP = 1e-5  # of a search coordinate, for slopes
 _EVEN = 0.1  # of a mean square, what is not passed on at least
 _FINER = 1e-2  # part of the accuracy at which the error of a simulation shows
@@ -39,8 +43,9 @@ class ExpectedErrors:
     the output is not known. chance: (n_outputs,), variance of that variance from one log to the
     next, by the noise of inputs, which a plant passes on slowly or at times. systematic:
     (n_samples, n_outputs, k), errors that go with the inputs, each by one standard deviation of
-    what makes it: the sample that a state starts at, the simulation, and last ``n_directions`` of
-    the parameters. passed_on: (n_samples, n_outputs), variance by noise of inputs at each sample.
+    what makes it: the sample that a state starts at, the zero of a channel, the simulation, and
+    last ``n_directions`` of the parameters. passed_on: (n_samples, n_outputs), variance by noise of
+    inputs at each sample.
     """
 
     noise: FloatArray
@@ -101,6 +106,12 @@ class FloorTest:
         """Outputs that can be tested."""
         return np.isfinite(self.ratio)
 
+    def above(self, chance: float) -> BoolArray:
+        """Outputs whose residuals are larger, noticeably and by less than a chance."""
+        with np.errstate(invalid="ignore"):
+            above: BoolArray = (self.ratio > _ABOVE) & (self.p_value < chance)
+        return above
+
 
 def expected_errors(
     simulator: BatchSimulator,
@@ -109,11 +120,12 @@ def expected_errors(
     record: Dataset,
     start: FloatArray,
     covariance: FloatArray | None,
+    closely: bool = False,
 ) -> ExpectedErrors:
     """Expected errors of a free run under an identified chromosome (n_free,) from a start.
 
     start: (n_states,). covariance: (n_free, n_free) of its coordinates, as ``Uncertainty`` has it;
-    None for exact parameters.
+    None for exact parameters. closely: from more draws of the inputs' noise, which take their time.
     """
     vector = space.full(chromosome[None])[0]
 
@@ -133,6 +145,7 @@ def expected_errors(
         run = simulator.trajectories(vector[None], record, n_steps, moved[None])[0]
         change = np.where(np.isfinite(run), run - undisturbed, 0.0)
         systematic.append(change[..., None])
+    systematic.extend(_by_zeros(runs, vector, record, undisturbed))
     directions = np.zeros((*undisturbed.shape, 0))
     if covariance is not None:
         directions = _by_parameters(runs, space, chromosome, covariance)
@@ -141,7 +154,9 @@ def expected_errors(
     variance = np.where(variance > 0.0, variance, np.nan)
     chance, passed_on = np.zeros(len(variance)), np.zeros_like(undisturbed)
     if np.any(record.input_noise):
-        squares, passed_on = _by_input_noise(runs, vector, record, undisturbed)
+        squares, passed_on = _by_input_noise(
+            runs, vector, record, undisturbed, _MANY if closely else _DRAWS
+        )
         variance, chance = variance + squares.mean(axis=0), squares.var(axis=0, ddof=1)
     errors = np.concatenate([*systematic, directions], axis=2)
     return ExpectedErrors(variance, chance, errors, passed_on, directions.shape[2])
@@ -170,6 +185,22 @@ def _noisy_starts(simulator: BatchSimulator, record: Dataset, run: FloatArray) -
     }
 
 
+def _by_zeros(
+    runs: Runs, vector: FloatArray, record: Dataset, undisturbed: FloatArray
+) -> Iterator[FloatArray]:
+    """Errors (n_samples, n_outputs, 1) by a deviation of each channel's zero that has one.
+
+    A plant sums up that of an input: of a long record it moves the outputs as much as noise does.
+    """
+    for error in np.diag(record.output_zero):
+        if error.any():
+            yield np.broadcast_to(error, undisturbed.shape)[..., None]
+    for error in np.diag(record.input_zero):
+        if error.any():
+            moved = runs(vector[None], replace(record, inputs=record.inputs + error))[0]
+            yield (moved - undisturbed)[..., None]
+
+
 def _by_parameters(
     runs: Runs, space: SearchSpace, chromosome: FloatArray, covariance: FloatArray
 ) -> FloatArray:
@@ -187,20 +218,20 @@ def _by_parameters(
 
 
 def _by_input_noise(
-    runs: Runs, vector: FloatArray, record: Dataset, undisturbed: FloatArray
+    runs: Runs, vector: FloatArray, record: Dataset, undisturbed: FloatArray, n: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Squares of each output by noise of the inputs: the mean of each draw, and of each sample.
+    """Squares of each output by noise of the inputs: the mean of each of n draws, of each sample.
 
-    (_DRAWS, n_outputs) and (n_samples, n_outputs).
+    (n, n_outputs) and (n_samples, n_outputs).
     """
-    rng, squares = np.random.default_rng(0), np.zeros((_DRAWS, undisturbed.shape[1]))
+    rng, squares = np.random.default_rng(0), np.zeros((n, undisturbed.shape[1]))
     each = np.zeros_like(undisturbed)
     for draw in squares:
         noise = rng.standard_normal(record.inputs.shape) * record.input_noise
         disturbed = runs(vector[None], replace(record, inputs=record.inputs + noise))[0]
         square = (disturbed - undisturbed) ** 2
         draw[:] = np.mean(square, axis=0)
-        each += square / _DRAWS
+        each += square / n
     return squares, each
 
 

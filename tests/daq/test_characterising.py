@@ -7,13 +7,16 @@ import re
 import shutil
 import signal
 import subprocess
+from dataclasses import replace
 
 import pytest
 import yaml
 
 from daq.characterise import characterise as use_case
 from daq.characterise.rounds import Request, Round, rounds_of
+from daq.errors import DeviceError
 from sim_rig.actuator import actuator
+from sim_rig.backend import SimulatedDevice
 from tests.daq.support import few_free, rig, start_rig, write_yaml
 
 pytestmark = pytest.mark.soak
@@ -234,6 +237,23 @@ def test_without_a_name_the_model_has_the_ends_of_its_amplifiers(
     request = use_case.characterise("simulated.yaml", 10.0, out=tmp_path / "c", config=config)
     assert request.model == named
     assert Request.load(tmp_path / "c").model == named
+
+
+@pytest.mark.parametrize(("fastest", "rate"), [(20_000.0, None), (1500.0, 1000.0), (800.0, 800.0)])
+def test_the_runs_sample_no_faster_than_the_device(tmp_path, monkeypatch, fastest, rate):
+    opened = SimulatedDevice.open
+    monkeypatch.setattr(
+        SimulatedDevice, "open", lambda self: replace(opened(self), max_rate=fastest)
+    )
+    monkeypatch.setattr(use_case, "resume", lambda folder, **_: Request.load(folder))
+    request = use_case.characterise("simulated.yaml", 10.0, out=tmp_path / "c")
+    assert request.settings == (() if rate is None else (f"sample_rate={rate}",))
+    if rate is not None:
+        with pytest.raises(DeviceError, match=r"up to \d+ Hz; sample_rate 2000 Hz is too"):
+            use_case.characterise(
+                "simulated.yaml", 10.0, out=tmp_path / "d", settings=["sample_rate=2000"]
+            )
+        assert not (tmp_path / "d").exists()
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid import BatchSimulator, Dataset
+from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.examples import lag, lag_record
 from sysid.judging.expected_errors import ExpectedErrors, expected_errors, floor_test
 from sysid.problem.space import SearchSpace
@@ -14,11 +14,13 @@ from sysid.problem.space import SearchSpace
 START = np.zeros(1)
 
 
-def of_truth(model, record) -> tuple[np.ndarray, ExpectedErrors]:
+def of_truth(model, record, closely=False) -> tuple[np.ndarray, ExpectedErrors]:
     """Residuals of the right parameters, and what they are expected to be."""
     simulator, vector = BatchSimulator(model, accuracy=1e-6), model.nominal
     run = simulator.trajectories(vector, record, None, START[None])[0]
-    expected = expected_errors(simulator, SearchSpace.of(model), vector, record, START, None)
+    expected = expected_errors(
+        simulator, SearchSpace.of(model), vector, record, START, None, closely
+    )
     return record.outputs - run, expected
 
 
@@ -73,3 +75,47 @@ def test_windows_that_are_known_so_well_only_are_a_known_noise():
     wrong = replace(jittered, jitter=np.full((n, 1), 1e-4))
     test = floor_test(*of_truth(model, wrong))
     assert test.ratio[0] > 2.0 and test.p_value[0] < 1e-6
+
+
+def summing() -> ProcessModel:
+    """The output is the sum of the input over time, from zero on."""
+    return ProcessModel(
+        name="summing",
+        states=(State("sum", "1"),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("y", "1"),),
+        parameters=(Parameter("k", "1", 1.0, 0.1, 10.0),),
+        derivative=lambda x, u, p: (p[0] * u[0],),
+        output=lambda x, u, p: (x[0],),
+    )
+
+
+def test_a_sum_of_an_inputs_noise_is_as_often_so_large_as_is_told():
+    """Most of a random walk's mean square is one slow swing: three times the mean is no rarity."""
+    n, dt, rng = 400, 0.01, np.random.default_rng(5)
+    blank, noise = np.zeros((n, 1)), {"input_noise": np.array([1.0])}
+    record = Dataset(blank, blank, dt, output_noise=np.array([1e-3]), **noise)
+    roughly, closely = (of_truth(summing(), record, closely)[1] for closely in (False, True))
+    mean_square = dt**2 * (n - 1) / 2.0
+    np.testing.assert_allclose(roughly.variance, mean_square, rtol=0.5)
+    np.testing.assert_allclose(closely.variance, mean_square, rtol=0.13)
+    walks = dt * np.cumsum(rng.standard_normal((4000, n - 1)), axis=1)
+    p_values = np.array([floor_test(walk[:, None], closely).p_value[0] for walk in walks])
+    assert 0.0003 < np.mean(p_values < 0.001) < 0.004
+    assert 0.03 < np.mean(p_values < 0.05) < 0.08
+    assert 0.2 < np.mean(p_values < 0.3) < 0.4
+
+
+def test_errors_of_zeros_are_expected_and_an_inputs_adds_up():
+    n, dt = 400, 0.01
+    zeros = {"input_zero": np.array([0.1]), "output_zero": np.array([0.02])}
+    blank = np.zeros((n, 1))
+    record = Dataset(blank, blank, dt, output_noise=np.array([1e-3]), **zeros)
+    expected = of_truth(summing(), record)[1]
+    time = dt * np.arange(n)
+    mean_square = 1e-6 + 0.02**2 + 0.1**2 * np.mean(time**2)
+    np.testing.assert_allclose(expected.variance, mean_square, rtol=1e-6)
+    for sign in (-1.0, 1.0):
+        drift = sign * 0.15 * time[:, None]
+        assert floor_test(drift, expected).p_value[0] > 0.1
+    assert floor_test(drift, replace(expected, systematic=blank[..., None])).p_value[0] < 1e-6

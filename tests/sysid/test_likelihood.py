@@ -102,6 +102,13 @@ def test_aliases_have_the_same_multiplier_over_a_sample():
     assert len(set(frequencies)) >= 2
 
 
+def test_a_mode_that_nothing_free_acts_on_has_no_aliases():
+    model = oscillator(900.0, 100.0, 5000.0)
+    space = SearchSpace.of(model, fixed={"frequency": 900.0, "damping": 60.0})
+    target = Objective(BatchSimulator(model), space, [record_of(model, 0.01)])
+    assert lookalikes(target, np.array([1.0])) == []
+
+
 def test_every_mode_that_sampling_hardly_sees_has_aliases():
     def derivative(x, u, p):
         return (
