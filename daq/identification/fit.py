@@ -368,7 +368,7 @@ def assemble(
         watch(Progress("Profiles", k + 1, len(names), f"of {name}"))
     training, validation = ([_fitted(log, estimator, uncertainty) for log in part] for part in logs)
     faults = faults_of(problem, logs) if faults is None else faults
-    runs = [(fitted.log.dataset, fitted.run) for fitted in training]
+    runs = [(fitted.log.dataset, fitted.run, fitted.result.evened) for fitted in training]
     faults = after_explaining(faults, problem.model, "training", runs)
     parts = profiles, training, validation, folder
     return Identification(problem, estimator, uncertainty, *parts, faults=faults)

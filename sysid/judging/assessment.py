@@ -70,6 +70,7 @@ class RecordResult:
     starts: initial states that were estimated from the record. shared, by_speed: (n_outputs,),
     correlations as of ``shared_errors`` and ``errors_by_speed``; None where they were not tested.
     alone: (n_outputs,), shares as of ``errors_alone``; None of a run that did not come to the end.
+    evened: (n_samples, n_outputs), the residuals as of ``ExpectedErrors.evened``.
     """
 
     name: str
@@ -77,6 +78,7 @@ class RecordResult:
     metrics: Metrics
     residuals: ResidualTest
     independent: FloatArray
+    evened: FloatArray
     floor: FloorTest | None = None
     noise: FloorTest | None = None
     starts: Starts | None = None
@@ -170,6 +172,7 @@ def examine(
             residual, record.inputs, record.input_noise, systematic=systematic, later=later
         ),
         independent,
+        evened,
         None if expected is None else floor_test(residual, expected, independent),
         None if exact is None else floor_test(residual, exact, independent),
         starts,

@@ -79,7 +79,10 @@ def verdict_of(
                 faults,
                 estimator.simulator().model,
                 "training",
-                list(zip(training, runs, strict=True)),
+                [
+                    (record, run, result.evened)
+                    for record, (run, result) in zip(training, trained, strict=True)
+                ],
             ),
         ),
         findings=None if suspicion is None else suspicion.findings,

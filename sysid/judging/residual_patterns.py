@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import bdtrc
 
 from sysid.arrays import BoolArray, FloatArray
-from sysid.judging.residual_tests import residual_test
+from sysid.judging.residual_tests import autocorrelations, residual_test
 from sysid.problem.channels import MEDIAN_OF_NORMAL, off_neighbours, resolution
 from sysid.uncertainty.estimate import Z95
 
@@ -63,13 +63,23 @@ def errors_by_speed(
         errors, speeds = np.abs(residual[seen, j]), rates[seen, j]
         if seen.sum() < 50 or not all(map(np.ptp, (errors, speeds, past[seen, j]))):
             continue
-        ranks, chance = _ranks(errors), 1.0 / np.sqrt(seen.sum())
-        correlation = float(np.corrcoef(ranks, _ranks(speeds))[0, 1])
+        ranks, fast = _ranks(errors), _ranks(speeds)
+        correlation, chance = float(np.corrcoef(ranks, fast)[0, 1]), _by_chance(ranks, fast)
         # What comes after an error may answer it, as under feedback; what was before does not.
         before = float(np.corrcoef(ranks, _ranks(past[seen, j]))[0, 1])
         sure = correlation > _SURE * chance and before > max(_LIKELY * chance, _PART * correlation)
         trend[j] = correlation if sure else 0.0
     return trend
+
+
+def _by_chance(ranks: FloatArray, others: FloatArray) -> float:
+    """Standard deviation of the correlation of two series (n,) that have nothing in common.
+
+    Slow ones go together for a while: as of Bartlett's in ``residual_test``.
+    """
+    both = np.stack([ranks - ranks.mean(), others - others.mean()], axis=1)
+    common = float(np.sum(np.prod(autocorrelations(both), axis=1)))
+    return float(np.sqrt(max(common, 1.0) / len(ranks)))
 
 
 def errors_alone(residual: FloatArray, outputs: FloatArray) -> FloatArray:

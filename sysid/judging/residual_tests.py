@@ -69,7 +69,7 @@ def residual_test(
     seen = np.isfinite(residual)
     e, u = _standard(residual), _standard(inputs)
     counted = np.maximum(seen.sum(axis=0), 1)
-    auto = _autocorrelations(e)
+    auto = autocorrelations(e)
     cross = np.stack([_products(e, u, k) for k in range(n_lags)]) / counted[:, None]
     if later is not None:
         cross[0, :, later] = 0.0
@@ -92,7 +92,7 @@ def residual_test(
     )
 
 
-def _autocorrelations(values: FloatArray) -> FloatArray:
+def autocorrelations(values: FloatArray) -> FloatArray:
     """Of columns of mean zero, (n, k), at lags from 0 on and, behind them, from -1 back, (2 n, k).
 
     0 of a column that never changes.
@@ -111,7 +111,7 @@ def _spectrum(values: FloatArray) -> FloatArray:
 def _coloured(auto: FloatArray, u: FloatArray, n_lags: int) -> FloatArray:
     """Covariances of correlations that many lags apart, (n_lags, n_outputs, n_inputs), times n.
 
-    auto: (2 n, n_outputs), as of ``_autocorrelations``. Sums over all j of R_e(j) R_u(j + lag), by
+    auto: (2 n, n_outputs), as of ``autocorrelations``. Sums over all j of R_e(j) R_u(j + lag), by
     Parzen's window as far as they can be told: of slow residuals and inputs that change seldom,
     correlations are wide, and all lags tell the same.
     """

@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.channels import (
+    MEDIAN_OF_NORMAL,
     coarse_steps,
     noise,
     off_neighbours,
@@ -47,6 +48,7 @@ _ENOUGH = 0.3  # of a record, that is worth to be fitted by itself
 _GROSS = 5.0  # of a command's deviation, beyond which a single value is no command
 _IN_VALIDATION = "no parameter comes of it, but errors in validation do"
 _LEFT_OUT = "as 'robust: true' has it, these samples count as not measured"
+_BY_NOISE = 7.0  # deviations of noise that a sample may be off its neighbours for no other reason
 _ACCOUNTED = 0.5  # of how far a sample stands off, that a model may leave to explain it
 _COARSE = 16  # steps in a channel's span, below which they are seen in the parameters
 
@@ -157,12 +159,14 @@ def after_explaining(
     faults: Sequence[DataFault],
     model: ProcessModel,
     part: Part,
-    runs: Sequence[tuple[Dataset, FloatArray]],
+    runs: Sequence[tuple[Dataset, FloatArray, FloatArray]],
 ) -> tuple[DataFault, ...]:
     """Faults without outputs' samples that stand off their neighbours, where a model's do as well.
 
-    As a current at which a shaft is stopped. runs: records of a part, and free runs of the model on
-    them, (n_samples, n_outputs).
+    As a current at which a shaft is stopped; or where nothing stands off in what a model leaves, as
+    of an amplifier at the end of its range, whose every jolt hangs on what went before. runs:
+    records of a part, free runs of the model on them, (n_samples, n_outputs), and what these leave,
+    evened as of ``ExpectedErrors``.
     """
     return tuple(
         fault
@@ -170,23 +174,26 @@ def after_explaining(
         if (fault.kind, fault.part) != ("outliers", part)
         or fault.channel not in model.output_names
         or not all(
-            _explains(record, run, model.output_names.index(fault.channel))
-            for record, run in runs
+            _explains(record, run, evened, model.output_names.index(fault.channel))
+            for record, run, evened in runs
             if record.name in fault.records
         )
     )
 
 
-def _explains(record: Dataset, run: FloatArray, output: int) -> bool:
-    """Whether of each sample that stands off a run leaves less than half of that."""
+def _explains(record: Dataset, run: FloatArray, evened: FloatArray, output: int) -> bool:
+    """Whether of each sample that stands off a run leaves less than half, or no more than noise."""
     values = record.outputs[:, output]
     jolts = spikes(values, record.inputs, _averaged(record, output))
     if jolts is None:  # none are left in it
         return False
-    off, left = (
-        np.abs(off_neighbours(signal))[jolts.at] for signal in (values, values - run[:, output])
+    off, left, beside = (
+        np.abs(off_neighbours(signal))
+        for signal in (values, values - run[:, output], evened[:, output])
     )
-    return bool(np.all(left < _ACCOUNTED * off))
+    usual = np.nanmedian(beside) / MEDIAN_OF_NORMAL
+    explained = (left < _ACCOUNTED * off) | (beside < _BY_NOISE * usual)
+    return bool(np.all(explained[jolts.at]))
 
 
 def _merged(faults: Sequence[DataFault]) -> list[DataFault]:

@@ -351,9 +351,24 @@ def test_samples_that_stand_off_in_the_model_as_well_are_no_outliers(explained, 
     faults = data_faults(model(), [record])
     assert [fault.kind for fault in faults] == ["outliers"]
     jolts[places[explained:]] = 0.0
-    runs = [(record, exact.outputs + 0.8 * jolts)]
+    run = exact.outputs + 0.8 * jolts
+    runs = [(record, run, record.outputs - run)]
     assert len(after_explaining(faults, model(), "training", runs)) == left
     assert after_explaining(faults, model(), "validation", runs) == faults
+
+
+@pytest.mark.parametrize(("expected", "left"), [(0.2, 0), (0.05, 1)])
+def test_samples_that_stand_off_as_far_as_noise_of_inputs_lets_them_are_no_outliers(expected, left):
+    record = driven(levels())
+    jolts = np.zeros((N, 1))
+    jolts[[150, 450]] = 0.8
+    jolted = replace(record, outputs=record.outputs + jolts)
+    faults = data_faults(model(), [jolted])
+    run = driven(levels(), noise=0.0).outputs
+    residual = jolted.outputs - run
+    evened = residual / np.where(jolts > 0.0, expected / residual[:100].std(), 1.0)
+    runs = [(jolted, run, evened)]
+    assert len(after_explaining(faults, model(), "training", runs)) == left
 
 
 def test_outliers_of_a_measured_input_are_named_and_mended():
