@@ -113,7 +113,7 @@ class Whitener:
         for j, kalman in self.filters.items():
             fast[:, j] = kalman.innovations(fast[:, j], rows)
         white: FloatArray = _filtered(self._filter, fast)[self.kept[rows][order:]]
-        whole[:, felt] = white.reshape(len(whole), -1)
+        whole[:, felt] = white.reshape(len(whole), int(felt.sum()))
         return whole
 
     def back(self, rows: slice, white: FloatArray) -> FloatArray:

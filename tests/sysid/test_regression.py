@@ -36,3 +36,15 @@ def test_a_finding_by_chance_is_as_rare_as_its_probability_says_however_few_draw
     found = chances(n_draws, n_amplitudes)
     for level in (0.05, 0.01):
         assert 0.5 * level < np.mean(found < level) < 1.6 * level
+
+
+def test_a_record_of_which_no_sample_has_a_whole_past_tells_nothing():
+    """As of an encoder that turns round at every other sample."""
+    model = Autoregression(np.full((2, 1, 1), 0.2), np.eye(1))
+    seen = np.ones((2 * N, 1), dtype=bool)
+    seen[1:N:2] = False
+    whitening = Whitener.by(model, seen, (N, N))
+    columns = np.random.default_rng(0).standard_normal((2 * N, 1, 3))
+    white = whitening(columns)
+    np.testing.assert_allclose(white, Whitener.by(model, seen[N:], (N,))(columns[N:]))
+    assert not whitening.back(slice(0, N), white).any()
