@@ -21,8 +21,10 @@ from daq.config.yaml_file import TypedSettings
 from daq.designs.design import choose, write
 from daq.designs.files import DATA
 from daq.designs.setup import Setup, set_up
+from daq.diagnose.sampling import fastest, kept_up_with
 from daq.errors import ConfigError, DeviceError, InterlockError, RigError, Terminated
 from daq.files import make_folder
+from daq.hal import Device
 from daq.identification.fit import check_writable, fit
 from daq.identification.request import CHECKPOINT, SettingsRequest
 from daq.identification.result import Identification
@@ -34,7 +36,6 @@ from daq.notation import quantity
 from daq.progress import Note, Started, Watch, ignore
 from daq.recording.session import SEEDS, first_seed, record
 from daq.report.publication import publish
-from daq.rig import Rig
 from daq.views import Lines, Shown
 from sysid import Design
 
@@ -148,13 +149,13 @@ def characterise(
         tuple(settings),
         ask is not None,
     )
-    rig_config, device = load_rig(str(rig), watch=watch)
+    _, device = load_rig(str(rig), watch=watch)
     now = datetime.datetime.now(datetime.UTC)
     folder = Path(out) if out is not None else Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-characterise"
     check_writable(folder)
     for mounted in mounted_rigs(request):
         set_up(_question(request, mounted, [], request.time), watch)
-    request = _no_faster(request, Rig(device, rig_config), watch)
+    request = _in_time(request, device, watch)
     request.save(folder)
     return resume(folder, ask=ask, watch=watch)
 
@@ -217,31 +218,23 @@ def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> C
     )  # fmt: skip
 
 
-def _no_faster(request: Request, rig: Rig, watch: Watch) -> Request:
-    """A request that samples as fast as it says, or as the rig's device can where nothing says.
+def _in_time(request: Request, device: Device, watch: Watch) -> Request:
+    """A request that samples as fast as it says, or else as device and computer keep up with.
 
     Raises DeviceError for a device that is not there, or slower than was asked for.
     """
     file = _question(request, mounted_rigs(request)[0], [], request.time)
-    rate = check.validate(file, Question).sample_rate
-    try:
-        device = rig.open()
-    finally:
-        rig.close()
-    if device.max_rate >= rate:
-        return request
-    at_most = f"{device.name} samples at up to {device.max_rate:g} Hz"
+    wanted = check.validate(file, Question).sample_rate
     if "sample_rate" in file.content:
-        raise DeviceError(f"{at_most}; sample_rate {rate:g} Hz is too fast for it")
-    rate = _round_below(device.max_rate)
-    watch(Note("note", f"{at_most}; the runs sample at {rate:g} Hz"))
+        at_most = fastest(device)
+        if at_most < wanted:
+            too_fast = f"sample_rate {wanted:g} Hz is too fast for it"
+            raise DeviceError(f"the device samples at up to {at_most:g} Hz; {too_fast}")
+        return request
+    rate = kept_up_with(device, wanted, watch)
+    if rate == wanted:
+        return request
     return replace(request, settings=(*request.settings, f"sample_rate={rate!r}"))
-
-
-def _round_below(rate: float) -> float:
-    """The next rate below that most clocks can be divided down to: one digit, and noughts."""
-    size = 10.0 ** math.floor(math.log10(rate))
-    return max(digit * size for digit in (1.0, 2.0, 4.0, 5.0, 8.0) if digit * size <= rate)
 
 
 def _nothing_to_tell(first: Round) -> ConfigError:

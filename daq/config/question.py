@@ -56,7 +56,8 @@ class Question(Section):
         2000.0,
         gt=0.0,
         le=1e6,
-        description="samples per second; rig characterise takes fewer where the device is slower",
+        description="samples per second; rig characterise takes fewer by itself where device or "
+        "computer do not keep up",
     )
     calibration: int = Field(
         3200, ge=1, le=1_000_000, description="samples of the offset calibration before each run"

@@ -1,17 +1,21 @@
 """Whether a device samples in time, in open and in closed loop, at zero command."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
-from daq.contract import call, checked_room, checked_samples
+from daq.contract import call, checked_info, checked_room, checked_samples
 from daq.diagnose.computer import Check, Verdict
-from daq.errors import ConfigError, RigError
+from daq.errors import ConfigError, DeviceError, RigError
 from daq.hal import ANALOG_INPUTS, CHANNELS, Device, DeviceInfo, Flag, Guard, Mode
+from daq.progress import Note, Progress, Watch, ignore
 from daq.run.pace import Pace
 from daq.run.realtime import RealTime
 
 USUAL = 800.0  # Hz, of the shipped experiments
+_USUAL_RATES = (5000.0, 2000.0, 1000.0, USUAL, 500.0, 200.0, 100.0)  # which most clocks divide into
 _SPAN = 2.5  # s in each mode: as long as a timer takes to show that it is too slow
 _FEW = 0.01  # of the commands
 _LATE = (
@@ -41,6 +45,46 @@ def sampling_checks(device: Device, info: DeviceInfo, sample_rate: float | None)
     finally:
         realtime.undo()
     return checks
+
+
+def fastest(device: Device) -> float:
+    """Samples per second that a device takes at most, as it says itself [Hz]."""
+    with _opened(device) as info:
+        return info.max_rate
+
+
+def kept_up_with(device: Device, rate: float, watch: Watch = ignore) -> float:
+    """The fastest usual rate up to ``rate`` [Hz] with which device and computer keep up.
+
+    Seconds at zero command show it in either mode, of a device that has a clock of its own. Raises
+    DeviceError where they keep up with none.
+    """
+    slow: list[Check] = []
+    for tried in sorted({rate, *_USUAL_RATES}, reverse=True):
+        with _opened(device) as info:
+            if tried > min(rate, info.max_rate):
+                continue
+            status = f"{tried:g} Hz, outputs at zero"
+            if not info.virtual_time:
+                watch(Progress("Sample rate", 0, 1, status))
+            slow = [c for c in sampling_checks(device, info, tried) if c.verdict == "bad"]
+            if not info.virtual_time:
+                watch(Progress("Sample rate", 1, 1, status))
+        if not slow:
+            return tried
+        watch(Note("note", f"{slow[0].subject}: {slow[0].observation}"))
+    if slow:
+        raise DeviceError(f"{slow[0].subject}: {slow[0].observation}", cure=slow[0].cure)
+    raise DeviceError(f"{info.name} samples at up to {info.max_rate:g} Hz, no usual rate")
+
+
+@contextmanager
+def _opened(device: Device) -> Iterator[DeviceInfo]:
+    """What a device says of itself, open meanwhile."""
+    try:
+        yield checked_info(call(device.open))
+    finally:
+        call(device.close)
 
 
 def _sampled(device: Device, info: DeviceInfo, mode: Mode, rate: float) -> Check:
