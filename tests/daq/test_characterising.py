@@ -22,7 +22,7 @@ from tests.daq.support import few_free, rig, start_rig, write_yaml
 pytestmark = pytest.mark.soak
 
 FREE = {"R_m", "K_m", "B_m"}
-QUICK = ["candidates=8", "generations=0", "draws=1", "checks=2", "calibration=16", "run=0.5 s"]
+QUICK = ["candidates=8", "generations=0", "draws=1", "checks=2", "calibration=400", "run=0.5 s"]
 
 
 def words(*more):
@@ -85,7 +85,7 @@ def test_the_intervals_hold_what_the_simulated_rig_is_made_of(finished):
         assert off <= 1.5 * quantity["width"]  # three standard deviations
         half = 0.5 * (quantity["high"] - quantity["low"])
         assert half == pytest.approx(quantity["width"] * quantity["value"])
-    # 1.5 s and a calibration of 40 samples tell little of 2 mN m of bearings.
+    # 1.5 s and a calibration of 400 samples tell little of 2 mN m of bearings.
     assert all(determined[name]["width"] < 0.1 for name in ("R_m", "K_m"))
 
 

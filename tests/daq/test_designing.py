@@ -236,7 +236,7 @@ def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path)
     assert [u["names"] for u in document["unknown"]] == [["B_m"]] and not document["otherwise"]
     for run in document["runs"]:
         checked = rig("check", run["file"], "--json", cwd=tmp_path)
-        assert json.loads(checked.stdout)["samples"] == 1000
+        assert json.loads(checked.stdout)["samples"] == 2500
 
 
 MOST = ["--set", "targets.K_m=0.001"]  # asks for as many runs as the time holds
@@ -261,7 +261,7 @@ def test_the_commands_of_a_design_lead_from_its_files_to_one_result(asked, tmp_p
         rig(*shlex.split(command)[1:], cwd=tmp_path, timeout=300) for command in commands
     )
     assert (checked.returncode, run.returncode, identified.returncode) == (0, 0, 0)
-    assert checked.stdout.count("1000 samples at 800 Hz") == 2
+    assert checked.stdout.count("2500 samples at 2000 Hz") == 2
     assert printed_commands(checked.stdout) == commands[1:]
     assert printed_commands(run.stdout) == commands[2:]
     result = yaml.safe_load((tmp_path / printed_file(identified.stdout)).read_text("utf-8"))
