@@ -49,6 +49,7 @@ class Regression:
     ) -> None:
         self.whitening = whitening
         white, target = whitening(columns), whitening(residual[..., None])
+        free = np.where(white.any(axis=0), free, 1.0)  # what no row shows stands at zero
         self._n = len(target)
         self._left = self._n - white.shape[1] - whitening.model.coefficients.size
         self._basis = _Basis(

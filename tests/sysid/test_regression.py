@@ -48,3 +48,20 @@ def test_a_record_of_which_no_sample_has_a_whole_past_tells_nothing():
     white = whitening(columns)
     np.testing.assert_allclose(white, Whitener.by(model, seen[N:], (N,))(columns[N:]))
     assert not whitening.back(slice(0, N), white).any()
+
+
+def test_what_no_row_shows_stands_at_zero_and_changes_nothing():
+    """As a start of a record of which no sample has a whole past."""
+    rng = np.random.default_rng(0)
+    whitening = Whitener(
+        Autoregression(np.zeros((0, 1, 1)), np.eye(1)), (N,), np.ones(N, dtype=bool), np.eye(1)
+    )
+    column, change, residual = rng.standard_normal((3, N, 1, 1))
+    results = []
+    for columns in (column, np.concatenate([column, np.zeros((N, 1, 1))], axis=2)):
+        free = np.zeros(columns.shape[2])
+        tested = Regression(whitening, columns, free, residual[..., 0], [])
+        results.append((tested.coefficients, tested.test(change, one_sided=False)))
+    (alone, without), (beside, with_it) = results
+    assert beside[0] == pytest.approx(alone[0]) and beside[1] == 0.0
+    assert with_it.log_p == pytest.approx(without.log_p, rel=0.05)
