@@ -216,6 +216,7 @@ def from_recording(
     outputs = np.array([recording.noise(n) for n in model.output_names]).reshape(-1, 2).T
     calibrated = {"output_noise": outputs[0], "output_zero": outputs[1]}
     dataset = replace(dataset, input_noise=noise, input_zero=zero, **calibrated)
+    dataset = replace(dataset, planned=recording.planned)
     time = recording.columns["t"]
     whole = partial(_from_log, recording, model, recording.name, EVERYTHING, speeds)
     cut = _cut(selection, recording.path, time, whole)

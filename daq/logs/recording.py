@@ -100,6 +100,11 @@ class Recording(Shown):
         """Its rows as the run had them."""
         return Samples(**{attribute: self.columns[name] for name, attribute in ATTRIBUTES.items()})
 
+    @property
+    def planned(self) -> bool:
+        """Whether all commands are known to have been planned, so that none answers a sample."""
+        return self.record is not None and self.record.get("planned") is True
+
     def noise(self, channel: str) -> tuple[float, float]:
         """Standard deviations of a channel's noise and of its zero, as the calibration found them.
 

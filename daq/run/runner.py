@@ -203,6 +203,7 @@ class _Run:
         elif self.dialogue is not None:
             control(sampling, log, self.dialogue, self.plan.n_samples)
         elif self.plan.commands is not None:
+            self.capture.record["planned"] = True  # no command answers a sample
             play(sampling, log, self.plan.commands)
         sampling.enter(Phase.SAFE)
 

@@ -33,7 +33,8 @@ class Dataset:
     instant of the first row as whoever made the record counts time [s]. cut: whether it was cut
     from a longer record amid its motion, so that states whose first sample is a mean over the time
     before start elsewhere. log: of a part of a longer record the number of that, whose channels'
-    zeros all of its parts share; None of a whole one.
+    zeros all of its parts share; None of a whole one. planned: whether its exact inputs are known
+    to have been planned, so that none of them answers an output.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
     not finite, or infinite outputs.
@@ -59,6 +60,7 @@ class Dataset:
     begin: float = 0.0
     cut: bool = False
     log: int | None = None
+    planned: bool = False
 
     def __repr__(self) -> str:
         size = f"{self.n_samples} samples, dt={self.dt:g} s"

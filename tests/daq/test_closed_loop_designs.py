@@ -18,7 +18,7 @@ from daq.lookup.classes import find_class
 from daq.lookup.rigs import load_rig
 from protocols.control.staircase import Plateau, SettlingTest, longest, quickest
 from sim_rig.actuator import actuator
-from tests.daq.support import rig, write_yaml
+from tests.daq.support import record_of, rig, write_yaml
 
 SHAFT = Shaft(150.0, True, "between", None)
 FRAME = RunFrame(2000, 800.0, (-5.0, 5.0), (0.0, 0.38), SHAFT)
@@ -170,6 +170,7 @@ def test_a_design_for_a_free_shaft_writes_loops_that_run(tmp_path):
     assert ran.returncode == 0, ran.stderr
     run = json.loads(ran.stdout)["run"]
     assert 2500 <= run["samples"] <= 5000
+    assert "planned" not in record_of(tmp_path / run["folder"])
 
 
 CONTROLLER = """

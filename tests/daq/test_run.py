@@ -12,8 +12,10 @@ import pytest
 
 from daq.errors import ConfigError
 from daq.hal import Flag
+from daq.identification.records import from_recording
 from daq.logs.capture import Capture
 from daq.logs.recording import load
+from sim_rig.actuator import actuator
 from tests.daq.support import EXPERIMENT as SETTINGS
 from tests.daq.support import (
     environment,
@@ -102,9 +104,10 @@ def test_the_capture_folder_holds_the_run_as_resolved(completed):
     assert {
         "status", "reason", "started", "experiment", "rig", "software", "host", "device",
         "calibration", "offsets", "homing", "phase", "timing", "log", "realtime", "outputs",
-        "saturated_samples", "doubts", "process", "rig_file",
+        "saturated_samples", "doubts", "process", "rig_file", "planned",
     } == set(record)  # fmt: skip
     assert (record["status"], record["reason"], record["phase"]) == ("completed", None, "close")
+    assert record["planned"] is True and from_recording(load(folder), actuator()).dataset.planned
     assert record["experiment"] == {
         **merged(SETTINGS, {"homing": {"turns": 1.0, "timeout": 30.0}}),
         "calibration": {"samples": 16, "motion": 0.01, "current_motor": 0.1, "current_brake": 0.05},

@@ -1,5 +1,7 @@
 """Records under feedback: noise that the controller answers is no missing term, and is told."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,16 @@ def test_what_a_controller_answers_is_named_and_nothing_else_with_what_it_has_mo
         if truth is not None and abs(move.deviations) > 1.5:
             off = abs(move.quantity.value - truth)
             assert abs(move.quantity.value + move.change - truth) < 0.5 * off
+
+
+def test_a_planned_input_answers_nothing_however_it_looks():
+    record = controlled(1, 1, 5.0)
+    estimator = fitted(record, 1)
+    uncertainty = estimator.uncertainty(record)
+    for planned in (False, True):
+        told = dataclasses.replace(record, planned=planned)
+        findings = suspected(estimator, uncertainty, [told]).findings
+        assert any(f.kind == "feedback" for f in findings) != planned
 
 
 def test_noise_without_a_memory_moves_nothing_under_feedback():
