@@ -53,7 +53,7 @@ class Question(Section):
         None, gt=0.0, le=600.0, description="length of a run; default 1.25 s, or the time if less"
     )
     sample_rate: Hertz = Field(
-        2000.0,
+        4000.0,
         gt=0.0,
         le=1e6,
         description="samples per second; rig characterise takes fewer by itself where device or "

@@ -15,7 +15,8 @@ from daq.run.pace import Pace
 from daq.run.realtime import RealTime
 
 USUAL = 800.0  # Hz, of the shipped experiments
-_USUAL_RATES = (5000.0, 2000.0, 1000.0, USUAL, 500.0, 200.0, 100.0)  # which most clocks divide into
+# Hz; most clocks can be divided down to them.
+_USUAL_RATES = (4000.0, 2000.0, 1000.0, USUAL, 500.0, 200.0, 100.0)
 _SPAN = 2.5  # s in each mode: as long as a timer takes to show that it is too slow
 _FEW = 0.01  # of the commands
 _LATE = (

@@ -236,7 +236,7 @@ def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path)
     assert [u["names"] for u in document["unknown"]] == [["B_m"]] and not document["otherwise"]
     for run in document["runs"]:
         checked = rig("check", run["file"], "--json", cwd=tmp_path)
-        assert json.loads(checked.stdout)["samples"] == 2500
+        assert json.loads(checked.stdout)["samples"] == 5000
 
 
 MOST = ["--set", "targets.K_m=0.001"]  # asks for as many runs as the time holds
@@ -261,7 +261,7 @@ def test_the_commands_of_a_design_lead_from_its_files_to_one_result(asked, tmp_p
         rig(*shlex.split(command)[1:], cwd=tmp_path, timeout=300) for command in commands
     )
     assert (checked.returncode, run.returncode, identified.returncode) == (0, 0, 0)
-    assert checked.stdout.count("2500 samples at 2000 Hz") == 2
+    assert checked.stdout.count("5000 samples at 4000 Hz") == 2
     assert printed_commands(checked.stdout) == commands[1:]
     assert printed_commands(run.stdout) == commands[2:]
     result = yaml.safe_load((tmp_path / printed_file(identified.stdout)).read_text("utf-8"))
@@ -396,6 +396,7 @@ def test_a_rig_that_an_experiment_names_in_vain_is_told_with_its_line(tmp_path):
 
 @pytest.mark.soak
 def test_a_designed_run_passes_no_limit_and_is_identified(asked, tmp_path):
+    asked = write_yaml(asked, QUESTION | {"sample_rate": 800})
     rig("design", asked, "--out", "d", cwd=tmp_path)
     done = rig("run", "d/designed-1.yaml", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
