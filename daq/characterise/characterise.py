@@ -224,8 +224,9 @@ def _in_time(request: Request, device: Device, watch: Watch) -> Request:
     Raises DeviceError for a device that is not there, or slower than was asked for.
     """
     file = _question(request, mounted_rigs(request)[0], [], request.time)
-    wanted = check.validate(file, Question).sample_rate
-    if "sample_rate" in file.content:
+    question = check.validate(file, Question)
+    wanted = question.rate
+    if question.sample_rate is not None:
         at_most = fastest(device)
         if at_most < wanted:
             too_fast = f"sample_rate {wanted:g} Hz is too fast for it"

@@ -89,7 +89,7 @@ def _show(result: DesignResult) -> None:
     )
     terminal.print_table(title, head, rows, text=["unit"])
     if result.short:
-        more = 2.0 * result.question.sample_rate
+        more = 2.0 * result.question.rate
         narrowed = ", ".join(f"{q.name} to {number(100.0 * q.after, 2)} %" for q in result.short)
         terminal.print_text(
             f"Narrowed, but less than wanted: {narrowed}. What would help: more time, where the "

@@ -7,7 +7,8 @@ from pydantic import Field, model_validator
 from daq.config.base import Section
 from daq.config.units import Hertz, Part, Percent, Seconds, Turns
 
-_RUN = 1.25  # s, of a run where a question does not say
+# Where a question does not say: length of a run [s], and samples per second [Hz].
+_RUN, _RATE, _RATE_OF_STRUCTURES = 1.25, 4000.0, 800.0
 Targets = dict[str, Annotated[Percent, Field(gt=0.0, le=1000.0)]]
 
 
@@ -52,12 +53,13 @@ class Question(Section):
     run: Seconds | None = Field(
         None, gt=0.0, le=600.0, description="length of a run; default 1.25 s, or the time if less"
     )
-    sample_rate: Hertz = Field(
-        4000.0,
+    sample_rate: Hertz | None = Field(
+        None,
         gt=0.0,
         le=1e6,
-        description="samples per second; rig characterise takes fewer by itself where device or "
-        "computer do not keep up",
+        description="samples per second; default 4000, and 800 to tell structures apart, which "
+        "takes longer to compute; rig characterise takes fewer where device or computer do not "
+        "keep up",
     )
     calibration: int = Field(
         3200, ge=1, le=1_000_000, description="samples of the offset calibration before each run"
@@ -96,6 +98,11 @@ class Question(Section):
         if self.targets and self.precision is not None:
             raise ValueError("give targets or precision, not both")
         return self
+
+    @property
+    def rate(self) -> float:
+        """Samples per second [Hz]."""
+        return self.sample_rate or (_RATE if self.structures is None else _RATE_OF_STRUCTURES)
 
     @property
     def seconds(self) -> float:

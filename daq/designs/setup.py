@@ -126,7 +126,7 @@ def _set_up_each(
     recording = None if log is None else load_recording(log_path(Path(log)))
     if recording is not None:
         require_calibrated(Path(str(log)), recording)
-    first, rate = problems[0].model, question.sample_rate
+    first, rate = problems[0].model, question.rate
     noise = noise_of(file, question.noise, rig, first, rate, recording)
     if recording is None and not question.noise:
         shown = ", ".join(f"{name} {deviation:.2g}" for name, deviation in noise.items())
@@ -180,15 +180,15 @@ def _shaft(rig: RigConfig, model: ProcessModel, turns: float) -> Shaft | None:
 
 
 def _frame(file: YamlFile, question: Question, rig: RigConfig, shaft: Shaft | None) -> RunFrame:
-    n_samples = round(question.seconds * question.sample_rate)
+    n_samples = round(question.seconds * question.rate)
     if n_samples < 2:
-        problem = f"{question.seconds:g} s at {question.sample_rate:g} Hz makes {n_samples} samples"
+        problem = f"{question.seconds:g} s at {question.rate:g} Hz makes {n_samples} samples"
         raise file.error(("run",), problem, "make it longer")
     if question.seconds > question.time:
         problem = f"a run of {question.seconds:g} s is longer than the {question.time:g} s of all"
         raise file.error(("run",), problem, "make it shorter, or give more time")
     ranges = rig.limits.command
-    return RunFrame(n_samples, question.sample_rate, ranges.motor, ranges.brake, shaft)
+    return RunFrame(n_samples, question.rate, ranges.motor, ranges.brake, shaft)
 
 
 def _space(file: YamlFile, problem: Problem) -> SearchSpace:

@@ -88,4 +88,4 @@ def test_a_design_says_how_surely_it_tells_them_apart(tmp_path):
     assert pairs["friction stribeck", "friction none"]["probability"] > 0.95
     for run in document["runs"]:
         checked = rig("check", run["file"], "--json", cwd=tmp_path)
-        assert json.loads(checked.stdout)["samples"] == 1000
+        assert json.loads(checked.stdout)["samples"] == 200
