@@ -272,15 +272,16 @@ def _jumps(inputs: FloatArray) -> BoolArray:
     return jumps
 
 
-def standstill(values: FloatArray, inputs: FloatArray) -> Standstill | None:
+def standstill(values: FloatArray, inputs: FloatArray, averaged: FloatArray) -> Standstill | None:
     """Where a channel that is never twice the same repeats a value for long, then jumps.
 
     A channel that comes to rest slows down before, and one that has been at rest has not moved.
-    inputs: (n, n_inputs), whose jumps end a rest.
+    inputs: (n, n_inputs), whose jumps end a rest. averaged: (n,), samples over which each is a
+    mean, which is the same in all of them.
 
     >>> trace = np.arange(400) + 0.5 * np.random.default_rng(0).standard_normal(400)
     >>> trace[100:150] = trace[100]
-    >>> hang = standstill(trace, np.zeros((400, 1)))
+    >>> hang = standstill(trace, np.zeros((400, 1)), np.zeros(400))
     >>> hang.first, hang.length
     (100, 50)
     """
@@ -298,6 +299,7 @@ def standstill(values: FloatArray, inputs: FloatArray) -> Standstill | None:
     ends = begins + lengths
     slept = jumps[ends - 3] > jumps[begins + 4]
     caught &= slept | (jumps[np.minimum(ends + 1, len(values))] == jumps[ends - 3])
+    caught &= averaged[begins] < lengths - 2
     hangs = (lengths >= 20) & caught & (usual > 0.0)
     repeated = (int(same.sum()) - int((lengths[hangs] - 1).sum())) / len(values)
     if not hangs.any() or repeated > 0.1:

@@ -128,8 +128,9 @@ def mended(model: ProcessModel, record: Dataset) -> Dataset:
     """
     inputs, outputs = record.inputs.copy(), record.outputs.copy()
     for j, column in enumerate(outputs.T):
-        jolts = spikes(column, record.inputs, _averaged(record, j))
-        hang = standstill(column, record.inputs)
+        averaged = _averaged(record, j)
+        jolts = spikes(column, record.inputs, averaged)
+        hang = standstill(column, record.inputs, averaged)
         tests = (jolts, hang, *pile_ups(column))
         wrong = np.zeros(len(column), dtype=np.bool_)
         for test in tests:
@@ -302,7 +303,7 @@ class _Channel:
         yield self._fault("clipped", "doubt", statement, effect, cure, share)
 
     def _standstill(self) -> Iterator[DataFault]:
-        hang = standstill(self.values, self.inputs)
+        hang = standstill(self.values, self.inputs, self.averaged)
         if hang is None:
             return
         begin = hang.first * self.record.dt

@@ -114,6 +114,19 @@ FAULTS = {
 }
 
 
+@pytest.mark.parametrize(("averaged", "left"), [(40, 0), (5, 1)])
+def test_a_mean_is_the_same_in_all_samples_that_it_is_the_mean_of(averaged, left):
+    """As a speed between two edges of an encoder."""
+    record = changed(driven(levels(0), seed=0), hung)
+    same = np.flatnonzero(np.diff(record.outputs[:, 0]) == 0.0)
+    windows = np.zeros((N, 1, 2))
+    rows = np.arange(same[0], same[-1] + 2)
+    windows[rows, 0, 0], windows[rows, 0, 1] = (rows[0] - rows) * DT, (rows[0] - rows) * DT
+    windows[rows, 0, 1] += averaged * DT
+    faults = data_faults(model(), [replace(record, windows=windows)])
+    assert [fault.kind for fault in faults] == ["frozen"] * left
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_faulty_channel_is_named_with_its_number_and_cure(kind, seed):
