@@ -162,10 +162,10 @@ def fit(
         request.remember(folder, problem.request, _paths(training), _paths(validation))
     try:
         result, missing = None, None
+        minima = None if earlier is None else replace(earlier.minima, is_settled=False)
         if earlier is not None and earlier.minima.is_settled and not resume:
-            result = _beside(earlier, problem, logs, folder, watch, faults)
+            result, minima = _beside(earlier, problem, logs, folder, watch, faults)
         if result is None:
-            minima = None if earlier is None else replace(earlier.minima, is_settled=False)
             estimator = _searched(problem, train, folder, watch, resume, minima)
             problem = problem.starting(estimator.estimated_starts_)
             tell_starts(estimator.estimated_starts_, watch)
@@ -193,20 +193,25 @@ def _beside(
     folder: Path | None,
     watch: Watch,
     faults: tuple[DataFault, ...],
-) -> Identification | None:
-    """The minimum of all logs beside that of some; None where it is not the right one."""
+) -> tuple[Identification | None, EarlierMinima]:
+    """The minimum of all logs beside that of some, and where a search for another one begins.
+
+    None where it is not the right one; then the search begins there as well.
+    """
+    minima = replace(earlier.minima, is_settled=False)
     with contextlib.suppress(ConfigError):  # a simulation that fails there
         estimator = _searched(problem, logs[0], None, watch, False, earlier.minima)
         interrupted = estimator.stopped_ == "interrupted"
         noise = filter_noise(estimator), least_noise(estimator)
+        minima = EarlierMinima([estimator.parameters_, *minima.values], noise[0] or minima.noise)
         if interrupted or earlier.explains(estimator.parameters_, *noise):
             problem = problem.starting(estimator.estimated_starts_)
             tell_starts(estimator.estimated_starts_, watch)
             result = assemble(problem, estimator, logs, folder, watch, faults)
             if interrupted or earlier.agrees(result):
-                return result
+                return result, minima
     watch(Note("note", "the logs together want other parameters than before: a search begins"))
-    return None
+    return None, minima
 
 
 def tell_starts(names: Iterable[str], watch: Watch) -> None:

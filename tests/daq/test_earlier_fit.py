@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from daq import record
+from daq.identification import fit as use_case
 from daq.identification.earlier_fit import EarlierFit
-from daq.identification.fit import fit
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.progress import Note
@@ -30,7 +30,7 @@ def case(tmp_path_factory):
         record(file, out=folder / "runs", options={"seed": seed}).folder / "log.csv"
         for seed, file in enumerate(experiments)
     ]
-    earlier = fit(problem, logs[:1], [], examine=lambda result: False)
+    earlier = use_case.fit(problem, logs[:1], [], examine=lambda result: False)
     return problem, logs, earlier
 
 
@@ -49,7 +49,7 @@ def identified(case, values=None, ends=None, *, settled=True):
         noise = case[2].document["criterion"]["noise"]
         earlier = EarlierFit(EarlierMinima([values], noise, settled), ends)
     said = []
-    result = fit(
+    result = use_case.fit(
         problem, logs, [], None, said.append, examine=lambda result: False, earlier=earlier
     )
     return result, [note.text for note in said if isinstance(note, Note)]
@@ -80,6 +80,24 @@ def test_a_start_that_all_logs_speak_against_leads_to_a_search(case, searched):
     for name, (low, high) in of(searched)[1].items():
         value = of(searched)[0][name]
         assert of(begun)[0][name] == pytest.approx(value, abs=0.1 * (high - low))
+
+
+def test_a_search_begins_as_well_where_the_logs_have_led_from_a_start_that_they_speak_against(
+    case, monkeypatch
+):
+    values, ends = of(case[2])
+    wrong = {name: (1.2 * low, 1.2 * high) for name, (low, high) in ends.items()}
+    begun, searched = [], use_case._searched
+    monkeypatch.setattr(
+        use_case, "_searched", lambda *args: begun.append(args[-1]) or searched(*args)
+    )
+    start = {n: 1.2 * v for n, v in values.items()}
+    identified(case, start, wrong)
+    beside, anew = begun
+    assert beside.is_settled and not anew.is_settled
+    assert beside.values == [start] and anew.values[1:] == [start]
+    for name, value in values.items():
+        assert anew.values[0][name] == pytest.approx(value, rel=0.02)
 
 
 def test_logs_at_odds_or_noisier_than_before_speak_against_a_start(case):
