@@ -196,10 +196,12 @@ def raised_in(kind: type, error: BaseException) -> str:
     Empty where it passed through none, or where the class comes with this program.
     """
     try:
-        file = Path(inspect.getfile(kind))
+        file = Path(inspect.getfile(kind)).resolve()
     except (OSError, TypeError):
         return ""
-    installed = Path(__file__).parents[1]  # of an editable install the clone, users' files beside
+    installed = (
+        Path(__file__).resolve().parents[1]
+    )  # of an editable install the clone, users' files beside
     if any(file.is_relative_to(installed / package) for package in _PACKAGES):
         return ""
     line = line_in(error, file)
