@@ -199,9 +199,8 @@ def raised_in(kind: type, error: BaseException) -> str:
         file = Path(inspect.getfile(kind)).resolve()
     except (OSError, TypeError):
         return ""
-    installed = (
-        Path(__file__).resolve().parents[1]
-    )  # of an editable install the clone, users' files beside
+    # Of an editable install the clone, users' files beside.
+    installed = Path(__file__).resolve().parents[1]
     if any(file.is_relative_to(installed / package) for package in _PACKAGES):
         return ""
     line = line_in(error, file)
