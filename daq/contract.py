@@ -3,7 +3,8 @@
 import functools
 import json
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 from operator import attrgetter
@@ -22,7 +23,7 @@ from daq.errors import (
     UnreachedError,
     raised_in,
 )
-from daq.hal import ANALOG_INPUTS, CHANNELS, DeviceInfo, IntArray, RawSamples
+from daq.hal import ANALOG_INPUTS, CHANNELS, Device, DeviceInfo, IntArray, RawSamples
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -101,6 +102,15 @@ def checked_info(info: object) -> DeviceInfo:
         problem = f"returned {value} for {name} from open(): {first['msg']}"
         raise _breach(problem) from None
     return replace(checked, name=printable(checked.name))
+
+
+@contextmanager
+def opened(device: Device) -> Iterator[DeviceInfo]:
+    """What a device says of itself, open meanwhile."""
+    try:
+        yield checked_info(call(device.open))
+    finally:
+        call(device.close)
 
 
 def checked_room(room: object) -> int:

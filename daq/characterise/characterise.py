@@ -15,7 +15,7 @@ import numpy as np
 from daq.characterise.mounts import Ask, MountedRig, mounted_rigs
 from daq.characterise.page import write_page
 from daq.characterise.rounds import Interval, Request, Round, rounds_of
-from daq.config import check, yaml_file
+from daq.config import yaml_file
 from daq.config.question import Question
 from daq.config.yaml_file import TypedSettings
 from daq.designs.design import choose, write
@@ -153,9 +153,11 @@ def characterise(
     now = datetime.datetime.now(datetime.UTC)
     folder = Path(out) if out is not None else Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-characterise"
     check_writable(folder)
-    for mounted in mounted_rigs(request):
-        set_up(_question(request, mounted, [], request.time), watch)
-    request = _in_time(request, device, watch)
+    questions = [
+        set_up(_question(request, mounted, [], request.time), watch).question
+        for mounted in mounted_rigs(request)
+    ]
+    request = _in_time(request, questions[0], device, watch)
     request.save(folder)
     return resume(folder, ask=ask, watch=watch)
 
@@ -218,13 +220,11 @@ def _continued(root: Path, request: Request, ask: Ask | None, watch: Watch) -> C
     )  # fmt: skip
 
 
-def _in_time(request: Request, device: Device, watch: Watch) -> Request:
-    """A request that samples as fast as it says, or else as device and computer keep up with.
+def _in_time(request: Request, question: Question, device: Device, watch: Watch) -> Request:
+    """A request that samples as fast as its question says, or else as fast as can be kept up with.
 
     Raises DeviceError for a device that is not there, or slower than was asked for.
     """
-    file = _question(request, mounted_rigs(request)[0], [], request.time)
-    question = check.validate(file, Question)
     wanted = question.rate
     if question.sample_rate is not None:
         at_most = fastest(device)

@@ -2,7 +2,7 @@
 
 from daq.boards import loopback
 from daq.boards.device import CardDevice
-from daq.contract import call, checked_info
+from daq.contract import opened
 from daq.diagnose.computer import Check
 from daq.diagnose.sampling import sampling_checks
 from daq.errors import ConfigError, DeviceError
@@ -21,15 +21,12 @@ def diagnose_rig(
     if measure and not isinstance(device, CardDevice):
         cure = "leave --loopback out: what times its samples times its outputs as well"
         raise ConfigError("its backend is no card of another maker", cure=cure, file=name)
-    try:
-        info = checked_info(call(device.open))
+    with opened(device) as info:
         checks = [Check("rig", "good", info.name)]
         if measure and isinstance(device, CardDevice):
             checks.append(_phase(device))  # without which it plays nothing
         else:
             checks += sampling_checks(device, info, sample_rate)
-    finally:
-        call(device.close)
     caveats = device.caveats() if isinstance(device, Disclosing) else []
     promise = [Check("promise", "could be better", item.problem, item.cure) for item in caveats]
     return [*checks, *promise]

@@ -1,12 +1,10 @@
 """Whether a device samples in time, in open and in closed loop, at zero command."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 
-from daq.contract import call, checked_info, checked_room, checked_samples
+from daq.contract import call, checked_room, checked_samples, opened
 from daq.diagnose.computer import Check, Verdict
 from daq.errors import ConfigError, DeviceError, RigError
 from daq.hal import ANALOG_INPUTS, CHANNELS, Device, DeviceInfo, Flag, Guard, Mode
@@ -50,7 +48,7 @@ def sampling_checks(device: Device, info: DeviceInfo, sample_rate: float | None)
 
 def fastest(device: Device) -> float:
     """Samples per second that a device takes at most, as it says itself [Hz]."""
-    with _opened(device) as info:
+    with opened(device) as info:
         return info.max_rate
 
 
@@ -60,12 +58,11 @@ def kept_up_with(device: Device, rate: float, watch: Watch = ignore) -> float:
     Seconds at zero command show it in either mode, of a device that has a clock of its own. Raises
     DeviceError where they keep up with none.
     """
-    slow: list[Check] = []
-    for tried in sorted({rate, *_USUAL_RATES}, reverse=True):
-        with _opened(device) as info:
-            if tried > min(rate, info.max_rate):
-                continue
-            status = f"{tried:g} Hz, outputs at zero"
+    slow, at_most = list[Check](), fastest(device)
+    rates = sorted({rate, *_USUAL_RATES}, reverse=True)
+    for tried in (each for each in rates if each <= min(rate, at_most)):
+        status = f"{tried:g} Hz, outputs at zero"
+        with opened(device) as info:
             if not info.virtual_time:
                 watch(Progress("Sample rate", 0, 1, status))
             slow = [c for c in sampling_checks(device, info, tried) if c.verdict == "bad"]
@@ -76,16 +73,7 @@ def kept_up_with(device: Device, rate: float, watch: Watch = ignore) -> float:
         watch(Note("note", f"{slow[0].subject}: {slow[0].observation}"))
     if slow:
         raise DeviceError(f"{slow[0].subject}: {slow[0].observation}", cure=slow[0].cure)
-    raise DeviceError(f"{info.name} samples at up to {info.max_rate:g} Hz, no usual rate")
-
-
-@contextmanager
-def _opened(device: Device) -> Iterator[DeviceInfo]:
-    """What a device says of itself, open meanwhile."""
-    try:
-        yield checked_info(call(device.open))
-    finally:
-        call(device.close)
+    raise DeviceError(f"the device samples at up to {at_most:g} Hz, no usual rate")
 
 
 def _sampled(device: Device, info: DeviceInfo, mode: Mode, rate: float) -> Check:

@@ -215,8 +215,8 @@ def from_recording(
     noise, zero = np.array([recording.noise(n) for n in model.input_names]).reshape(-1, 2).T
     outputs = np.array([recording.noise(n) for n in model.output_names]).reshape(-1, 2).T
     calibrated = {"output_noise": outputs[0], "output_zero": outputs[1]}
-    dataset = replace(dataset, input_noise=noise, input_zero=zero, **calibrated)
-    dataset = replace(dataset, planned=recording.planned)
+    planned = recording.planned
+    dataset = replace(dataset, input_noise=noise, input_zero=zero, planned=planned, **calibrated)
     time = recording.columns["t"]
     whole = partial(_from_log, recording, model, recording.name, EVERYTHING, speeds)
     cut = _cut(selection, recording.path, time, whole)

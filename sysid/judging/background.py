@@ -25,6 +25,7 @@ from sysid.threads import Workers
 from sysid.uncertainty.colour import record_rows
 from sysid.uncertainty.sensitivity import (
     Sensitivity,
+    each_alone,
     input_noises,
     sensitivity,
     sharing_zeros,
@@ -259,13 +260,8 @@ def _zeros(runs: Sequence[FilteredRun], local: Sensitivity) -> FloatArray:
 def _by_zeros(run: FilteredRun) -> list[FloatArray]:
     """Changes of a run by a deviation of each channel's zero, outputs first."""
     outputs, inputs = run.record.outputs, run.record.inputs
-    changes = [run.logged(_throughout(outputs, e)) for e in _each(run.record.output_zero)]
-    return changes + [run.driven(_throughout(inputs, e)) for e in _each(run.record.input_zero)]
-
-
-def _each(deviations: FloatArray) -> list[FloatArray]:
-    """Of channels (n,) the deviation of each that has one, alone."""
-    return [error for error in np.diag(deviations) if error.any()]
+    changes = [run.logged(_throughout(outputs, e)) for e in each_alone(run.record.output_zero)]
+    return changes + [run.driven(_throughout(inputs, e)) for e in each_alone(run.record.input_zero)]
 
 
 def _throughout(like: FloatArray, values: FloatArray) -> FloatArray:

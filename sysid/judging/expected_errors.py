@@ -18,6 +18,7 @@ from sysid.fitting.means import Run, each_mean_once, scatter
 from sysid.judging.evidence import independent_of_each
 from sysid.problem.data import Dataset
 from sysid.problem.space import SearchSpace
+from sysid.uncertainty.sensitivity import each_alone
 
 # Realisations of the inputs' noise. They give a variance to within 22 %, and to within 6 % where a
 # test is to say that errors are larger.
@@ -192,13 +193,11 @@ def _by_zeros(
 
     A plant sums up that of an input: of a long record it moves the outputs as much as noise does.
     """
-    for error in np.diag(record.output_zero):
-        if error.any():
-            yield np.broadcast_to(error, undisturbed.shape)[..., None]
-    for error in np.diag(record.input_zero):
-        if error.any():
-            moved = runs(vector[None], replace(record, inputs=record.inputs + error))[0]
-            yield (moved - undisturbed)[..., None]
+    for error in each_alone(record.output_zero):
+        yield np.broadcast_to(error, undisturbed.shape)[..., None]
+    for error in each_alone(record.input_zero):
+        moved = runs(vector[None], replace(record, inputs=record.inputs + error))[0]
+        yield (moved - undisturbed)[..., None]
 
 
 def _by_parameters(

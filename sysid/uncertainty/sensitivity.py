@@ -230,10 +230,15 @@ def zero_errors(sensitivity: Sensitivity) -> Iterator[FloatArray]:
         first = records[places[0]]
         for j in np.flatnonzero(first.output_zero).tolist():
             yield sum((_by_output_zero(sensitivity, k, j) for k in places), np.zeros(()))
-        errors = [error for error in np.diag(first.input_zero) if error.any()]
+        errors = each_alone(first.input_zero)
         parts = [_input_changes(sensitivity, k, errors) for k in places]
         yield from (sum(changes, np.zeros(())) for changes in zip(*parts, strict=True))
     yield from given_errors(sensitivity)
+
+
+def each_alone(deviations: FloatArray) -> list[FloatArray]:
+    """Of channels (n,) the deviation of each that has one, alone."""
+    return [error for error in np.diag(deviations) if error.any()]
 
 
 def sharing_zeros(records: Sequence[Dataset]) -> list[list[int]]:
