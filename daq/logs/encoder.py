@@ -31,13 +31,23 @@ import numpy.typing as npt
 
 from daq.hal import FloatArray, IntArray
 
+BoolArray = npt.NDArray[np.bool_]
+
 SPEED = "omega"  # the column that a counter's rate makes
 
 _OFF_COUNT = 0.05  # counts that a printed angle may be off a whole one
 _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
-_CREDIBLE = 1.5  # growth of the speed within an interval that its neighbour can tell
 _LOST = 0.5  # part of the speed that is lost in an interval before a turn, which tells no mean
 _LOWER = 1.0 - 1e-6  # parts of a speed below which another is lower
+_GROWTH = 0.5  # of the speed within an interval, at most, that the next one can tell
+_SURE = (
+    0.3  # part of its speed lost in an interval, up to which those beside it tell how long it is
+)
+_BETWEEN = 0.1  # of how far intervals at both ends are apart, by which others may be beyond them
+_PASSES = 4  # from bounds of edges to which speeds are no bounds, and back
+# Square of how far bounds of an edge are apart, over the variance of where it is: 12, were all
+# places alike. Of what several bounds leave the middle is likelier, by 0.23 of its width.
+_NARROWED = 18.0
 _TINY = 1e-9  # counts a sample, of a shaft that stands
 # Square counts a sample that changes of the speed make of a kind of means; the part that may miss.
 _CLEAR, _ALIKE = 10.0, 0.3
@@ -96,7 +106,7 @@ class _Changes:
         return cls(rows, latest, gap, moved, rate, length, rates[behind], pause, whole)
 
     @property
-    def follows(self) -> npt.NDArray[np.bool_]:
+    def follows(self) -> BoolArray:
         """Whether the edge before each was passed in the same direction.
 
         Else the shaft has turned round since, over an edge that the count does not show. A rate of
@@ -112,23 +122,57 @@ class _Changes:
             slower = np.minimum(np.abs(self.rate), self.next_rate * np.sign(self.rate))
             return np.zeros(len(self.rows)), np.minimum(self.gap, 1.0 / np.maximum(slower, _TINY))
         # Speeding up, the shaft has passed it no longer ago than it would take for the next by now.
-        change = np.diff(self.rate, prepend=self.rate[0])
-        change /= np.diff(self.latest, prepend=self.latest[0] - 1.0)
+        gain = (self.next_rate - self.rate) * np.sign(self.rate) / (self.pause + self.length)
         with np.errstate(invalid="ignore"):
-            growth = np.nan_to_num(1.0 + np.sign(self.rate) * change * self.length**2, nan=1.0)
-        growth = np.where(self.slowing() > 0.0, 1.0, np.clip(growth, 1.0, _CREDIBLE))
-        most = np.minimum(self.gap, self.length / growth)
+            gain = np.clip(np.nan_to_num(gain * self.length**2), 0.0, _GROWTH)
+        gain[self.slowing() > 0.0] = 0.0  # where the speed shown may be a bound
+        most = np.minimum(self.gap, self.length / (1.0 + gain))
         # The edge before came in the sample as well, or not, unless the shaft has turned twice.
-        rest = self.gap - self.length
         within, before = np.abs(self.moved) > 1.0, (np.abs(self.moved) == 1.0) & self.follows
-        most = np.where(within & (rest > 0.0), np.minimum(most, rest), most)
+        rest, at_most = self.gap - self.length, self.gap - self.shortest()
+        most = np.where(within & (at_most > 0.0), np.minimum(most, at_most), most)
         return np.where(before & (rest > 0.0) & (rest < most), rest, 0.0), most
 
-    def slowing(self) -> FloatArray:
-        """Part of its speed, 0 to 1, that the shaft loses in each interval by what follows."""
-        loss = (self.rate - self.next_rate) * np.sign(self.rate) / self.pause
+    def shortest(self) -> FloatArray:
+        """How long each interval was at least, (n,), if the speed that was shown may be a bound."""
         with np.errstate(invalid="ignore"):
-            return np.clip(np.nan_to_num(loss * self.length**2), 0.0, 1.0)
+            bounded = np.minimum(self._earlier, self.length) * (1.0 - self.slowing())
+        return np.where(self.slowing() > 0.0, bounded, self.length)
+
+    def between_edges(self, means: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Bounds, (n,) each, of the time from the last edge of the change before to the last one.
+
+        Intervals that the log does not show are as long as those beside them, or in between.
+        means: (n,), which of the speeds are no bounds, whatever the others are.
+        """
+        more, shortest = np.abs(self.moved) - 1.0, np.where(means, self.length, self.shortest())
+        with np.errstate(invalid="ignore"):
+            beyond = _BETWEEN * np.abs(self._earlier - self.length)
+            least = more * (np.minimum(_shifted(shortest), shortest) - beyond) + shortest
+            most = more * (np.maximum(self._earlier, self.length) + beyond) + self.length
+        known = (more == 0.0) | self.whole | (self.length > 1.0 + _OFF_TICK)
+        return np.where(known, shortest, least), np.where(known, self.length, most)
+
+    @property
+    def _earlier(self) -> FloatArray:
+        return _shifted(self.length)
+
+    def slowing(self) -> FloatArray:
+        """Part of its speed, 0 to 1, that the shaft loses in each interval, (n,).
+
+        By what came before and by what follows: a speed that is a bound may be less than both.
+        """
+        before, since = np.append(0.0, self.rate[:-1]), np.diff(self.latest, prepend=0.0)
+        gone = (before - self.rate) * np.sign(self.rate) / np.maximum(since, self.length)
+        coming = (self.rate - self.next_rate) * np.sign(self.rate) / self.pause
+        with np.errstate(invalid="ignore"):
+            loss = np.nan_to_num(np.maximum(coming, gone) * self.length**2)
+        return np.clip(loss, 0.0, 1.0)
+
+
+def _shifted(lengths: FloatArray) -> FloatArray:
+    """Of each change the length of the change before, (n,)."""
+    return np.append(np.inf, lengths[:-1])
 
 
 @dataclass(frozen=True)
@@ -153,21 +197,30 @@ class _Intervals:
         heard = np.isfinite(wait)
         low, high = latest - np.where(heard, wait, most), latest - np.where(heard, wait, least)
         # An interval begins with the edge that ended the one before; the first row is no edge.
-        timed = np.isfinite(length) & changes.follows
-        timed &= (length > 1.0 + _OFF_TICK) | changes.whole
-        timed[:2] = False
+        linked = np.isfinite(length) & changes.follows
+        linked[:2] = False
         # Nor may the speed have gone at once since then, as where the shaft turned over and back.
         kept = np.sign(rates[changes.rows - 1]) == np.sign(np.append(0.0, rate[:-1]))
-        timed &= kept | (length >= _REST)
-        low, high, agreeing = _linked(low, high, length, timed)
+        linked &= kept | (length >= _REST)
+        timed = linked & ((length > 1.0 + _OFF_TICK) | changes.whole)
+        lost = changes.slowing()
+        linked &= timed | (lost < _SURE)
+        bounds = low, high
+        for _ in range(_PASSES):
+            means = timed | (lost == 0.0) | (latest - low < length - _OFF_TICK)
+            low, high, fits = _linked(*bounds, *changes.between_edges(means), linked)
+        agreeing = fits & timed
         # A speed may be a bound where the last edge may be as long ago as it says.
-        within, lost = (length <= changes.gap) & (not changes.whole), changes.slowing()
+        within = (length <= changes.gap) & (not changes.whole)
         bound = within & (latest - low >= length - _OFF_TICK)
         turning = within & (np.sign(changes.next_rate) != np.sign(rate)) & (lost > _LOST)
         if changes.whole:  # perhaps within the sample, over an edge and back
             turning = np.append(changes.moved[1:] * changes.moved[:-1] < 0.0, True)
         end, deviation = _mixed(low, high, latest, length, np.where(bound, lost, 0.0))
         edges = np.append(latest[0] - 1.0, 0.5 * (low + high)[:-1])
+        # Either end of a turn moves its mean by half of what both together do.
+        of_turns = 0.5 * np.hypot(deviation, np.append(0.0, deviation[:-1]))
+        deviation = np.where(rate == 0.0, of_turns, deviation)
         begin = np.where(rate == 0.0, edges, end - length)
         # A turn shows as a speed of zero, back over the edge before. Amid several edges nothing
         # tells when that was; nor, where the count goes on, how often the shaft has turned.
@@ -230,23 +283,33 @@ def _waits_by_silence(
 
 
 def _linked(
-    low: FloatArray, high: FloatArray, length: FloatArray, timed: npt.NDArray[np.bool_]
-) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
-    """Bounds of last edges, (n,) each, that intervals between them narrow, and which fit.
+    low: FloatArray, high: FloatArray, least: FloatArray, most: FloatArray, linked: BoolArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Bounds of last edges, (n,) each, that times between them narrow, and which of these fit.
 
-    timed: intervals that begin with the edge before. All of a chain of them shift together.
+    least, most: bounds of the time since the last edge before; linked: where they are known. They
+    narrow those behind and those before them, along whole chains.
     """
-    length = np.where(timed, length, 0.0)
-    begin, end = np.append(low[0], low[:-1]) + length, np.append(high[0], high[:-1]) + length
-    agreeing = timed & (np.maximum(low, begin) <= np.minimum(high, end) + _OFF_TICK)
-    since = np.cumsum(np.where(agreeing, length, 0.0))
-    firsts = np.flatnonzero(~agreeing)
-    chain = np.cumsum(~agreeing) - 1
-    earliest = np.maximum.reduceat(low - since, firsts)[chain] + since
-    latest = np.minimum.reduceat(high - since, firsts)[chain] + since
-    fits = earliest <= latest + _OFF_TICK
-    middle, half = 0.5 * (earliest + latest), 0.5 * np.maximum(latest - earliest, 0.0)
-    return np.where(fits, middle - half, low), np.where(fits, middle + half, high), agreeing
+    linked = linked & np.isfinite(most)
+    least, most = np.where(linked, least, 0.0), np.where(linked, most, 0.0)
+    begin, end = np.append(low[0], low[:-1]) + least, np.append(high[0], high[:-1]) + most
+    fits = linked & (np.maximum(low, begin) <= np.minimum(high, end) + _OFF_TICK)
+    chain = np.cumsum(~fits, dtype=np.int64)
+    soonest, latest = (np.cumsum(np.where(fits, each, 0.0)) for each in (least, most))
+    lowest = soonest + _largest(low - soonest, chain)
+    highest = latest - _largest(latest - high, chain)
+    lowest = latest + _largest((lowest - latest)[::-1], -chain[::-1])[::-1]
+    highest = soonest - _largest((soonest - highest)[::-1], -chain[::-1])[::-1]
+    agreed = lowest <= highest + _OFF_TICK
+    middle, half = 0.5 * (lowest + highest), 0.5 * np.maximum(highest - lowest, 0.0)
+    return np.where(agreed, middle - half, low), np.where(agreed, middle + half, high), fits
+
+
+def _largest(values: FloatArray, chain: IntArray) -> FloatArray:
+    """The largest of each value and those before it in its chain, (n,); chain: rising numbers."""
+    apart = (1.0 + np.ptp(values)) * chain
+    largest: FloatArray = np.maximum.accumulate(values + apart) - apart
+    return largest
 
 
 def _mixed(
@@ -262,15 +325,14 @@ def _mixed(
         np.where(mixed, x, 0.0) for x in (length, latest - 0.5 * (length + low + high))
     )
     part = np.divide(share * length, share * length + width, out=np.zeros(len(width)), where=mixed)
-    variance = (width**2 + part * (length**2 - width**2)) / 12.0 + part * (1.0 - part) * apart**2
+    variance = (1.0 - part) * width**2 / _NARROWED + part * length**2 / 12.0
+    variance += part * (1.0 - part) * apart**2
     return 0.5 * (low + high) + part * apart, np.sqrt(variance)
 
 
-def repeated(turns: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def repeated(turns: BoolArray) -> BoolArray:
     """Of turns of a shaft, (n,), those that have another next to them."""
-    again: npt.NDArray[np.bool_] = turns & (
-        np.append(False, turns[:-1]) | np.append(turns[1:], False)
-    )
+    again: BoolArray = turns & (np.append(False, turns[:-1]) | np.append(turns[1:], False))
     return again
 
 

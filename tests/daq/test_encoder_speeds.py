@@ -163,7 +163,7 @@ def test_a_turn_over_an_edge_and_back_within_a_sample_begins_an_interval(before,
 
 def cornered(t):
     # The speed goes up and down in straight lines between -1.5 and 1.5 rad/s, 23 times a second.
-    u = (t * 23.0 + 0.13) % 1.0
+    u = (t * 23.0 + 0.131) % 1.0
     area = np.where(u < 0.5, u * (u - 0.5), (u - 0.5) * (1.0 - u))
     return 0.21 + 6.0 / 23.0 * area
 
@@ -191,8 +191,53 @@ def test_errors_are_as_large_as_their_variances_say_where_the_speed_has_its_corn
     )  # fmt: skip
     error = speeds.values - mean_over(angle, speeds.windows)
     parts = error / np.sqrt(scatter(record)[:, 0] + 0.001**2)
-    assert 0.5 < np.sqrt(np.nanmean(parts**2)) < 1.1
+    assert 0.4 < np.sqrt(np.nanmean(parts**2)) < 1.2
     assert np.nanmax(np.abs(parts)) < 5.0
+
+
+def last_edges(angle, tick):
+    """Times of the last edge up to each tick [s], NaN before the first."""
+    t = np.arange(int(tick[-1]) * FINE + 1) * (DT / FINE)
+    edges = t[np.flatnonzero(np.diff(np.floor(angle(t) / COUNT))) + 1]
+    lasts = np.searchsorted(edges, tick * DT, side="right") - 1
+    return np.where(lasts < 0, np.nan, edges[lasts])
+
+
+def surging(t):
+    # 0.6 to 1.8 counts a sample, 31 times a second: edges that come one or two in a sample.
+    return 0.21 + COUNT / DT * (1.2 * t - 0.6 / (62.0 * math.pi) * np.cos(62.0 * math.pi * t))
+
+
+def test_edges_are_timed_by_those_before_and_behind_them():
+    """Alone, in a sample, each would be known to 0.29 intervals, at most 0.29 samples."""
+    tick, theta, omega = logged(surging, 0.6)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
+    moved = np.diff(theta, prepend=theta[0]) != 0.0
+    begun = np.isfinite(speeds.values) & moved & (tick > 2) & (speeds.windows[:, 1] <= 0.0)
+    late = (last_edges(surging, tick) - tick * DT - speeds.windows[:, 1])[begun] / DT
+    alone = np.sqrt(np.mean(np.minimum(1.0, COUNT / (DT * speeds.values[begun])) ** 2 / 12.0))
+    assert len(late) > 250 and alone > 0.2
+    assert np.sqrt(np.mean(late**2)) < 0.5 * alone
+    assert np.sqrt(np.mean((speeds.jitter[begun] / DT) ** 2)) < 0.5 * alone
+    assert abs(np.mean(late)) < 0.03
+
+
+def test_a_speed_that_is_a_bound_is_told_from_one_that_is_none():
+    """The edge came as long ago as the bound says, though the next speed shown is no less."""
+
+    lengths = np.full(40, 0.9)
+    lengths[20:22] = 0.98, 0.93
+    edges = np.append(0.0, np.cumsum(lengths))
+    edges += 20.03 - edges[20]  # from there on the next one is 0.98 samples away
+
+    def pausing(t):
+        return COUNT * (50.0 + np.interp(t / DT, edges, np.arange(len(edges))))
+
+    tick, theta, omega = logged(pausing, 30 * DT)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT, by_edges=True)
+    error = np.abs(last_edges(pausing, tick) - tick * DT - speeds.windows[:, 1])[21]
+    assert omega[21] == pytest.approx(COUNT / DT / 0.97, rel=2e-3) and omega[22] > omega[21]
+    assert error < 3.0 * speeds.jitter[21]
 
 
 def shaking(t):
