@@ -19,8 +19,10 @@ from sysid.experiments import Prior
 
 _VOLTS = 0.010  # rms at an analog input, where nothing tells more
 _COUNTS = 1.0 / 6.0  # of the count in a sample, by which a speed errs
-_TIMED = 0.1  # of that, beside what the instants of its edges do
-_WAIT = 0.5  # of a sample, to which counts and bounds tell how long the last edge was ago
+_TIMED = 0.03  # of that, beside what the instants of its edges do
+# Of how long the last edge was ago, to which an encoder's log tells it: parts of the time between
+# edges, of a sample at most, and of a sample where there is none in some.
+_INTERVAL, _WAIT, _LONE = 0.6, 0.2, 0.05
 _NEVER = 1e3  # s, by which a sample may be off that tells of no time
 
 
@@ -134,10 +136,11 @@ def expected_jitter(omega: FloatArray, dt: float, count: float) -> FloatArray:
     long that the sample tells nothing. omega: (n,) [rad/s]; count: angle of one [rad].
 
     >>> (1e3 * expected_jitter(np.array([0.1, 1.0, 10.0, 1.0]), 1e-3, 1e-3)).round(4).tolist()
-    [0.1443, 0.1443, 0.0289, 0.1443]
+    [0.0144, 0.0577, 0.0173, 0.0577]
     """
     length = count / np.maximum(np.abs(omega) * dt, 1e-3 * count)  # samples between edges
-    jitter = dt * np.minimum(length, _WAIT) / math.sqrt(12.0)
+    wait = np.where(length > 1.0, _LONE, np.minimum(_INTERVAL * length, _WAIT))
+    jitter = dt * wait / math.sqrt(12.0)
     return np.where(_between_turns(omega * (dt / count)), _NEVER, jitter)
 
 
