@@ -8,18 +8,21 @@ before. Which it is shows where the speed changes. Log and calibration tell wher
 - its length T from the speed, one count or those of the sample over |omega|, or, where the shaft
   has turned round and the speed is zero, from the edges at its ends;
 - its end, the last edge, from the sample in which the count has changed, no more than T before its
-  end. Of several edges in a sample the one before the last came in it, too, and closer as intervals
-  begin where those before them ended.
+  end. Of several edges in a sample the one before the last came in it, too.
+
+From the last edge of one sample to that of the next it takes an interval that the log shows, or
+several: those it does not show are as long as those beside them, or in between. So what is known of
+one edge narrows where all of a chain of them were. Of what is left the middle is likelier.
 
 Samples within an interval that is longer than a sample are given its mean, which the device could
 not know before it was over; what it showed instead is that of the interval before.
 
 A speed is never more than one count over the time since the last edge: where no edge comes for long
 it is a bound. In samples without an edge it tells when the last one was. In the sample of the edge
-itself nothing says whether it is a bound or a mean, if the shaft slows down. The part a T^2 / count
-of such speeds is bounds (a deceleration, edges at any phase), means over times T that end between T
-before the sample and the sample: on average where means over intervals end. Before a turn they are
-means of nothing. With the counts of a sample there are no bounds but in samples without an edge.
+itself it may be one wherever the shaft slows down and the edge may have come as long ago; the part
+a T^2 / count of such speeds is bounds (a deceleration, edges at any phase), means over times T that
+end between T before the sample and the sample. Before a turn they are means of nothing. With the
+counts of a sample there are no bounds but in samples without an edge.
 """
 
 from __future__ import annotations
@@ -40,10 +43,10 @@ _OFF_TICK = 0.02  # samples that printed speeds may put an edge off
 _LOST = 0.5  # part of the speed that is lost in an interval before a turn, which tells no mean
 _LOWER = 1.0 - 1e-6  # parts of a speed below which another is lower
 _GROWTH = 0.5  # of the speed within an interval, at most, that the next one can tell
-_SURE = (
-    0.3  # part of its speed lost in an interval, up to which those beside it tell how long it is
-)
-_BETWEEN = 0.1  # of how far intervals at both ends are apart, by which others may be beyond them
+_SURE = 0.3  # part of its speed lost in an interval, up to which those beside it tell of it
+# Of how far intervals next to each other are apart, by which one in between may be beyond them.
+_BETWEEN = 0.1
+_BESIDE = 0.05  # of a sample, from an edge that a bound would tell to where it is
 _PASSES = 4  # from bounds of edges to which speeds are no bounds, and back
 # Square of how far bounds of an edge are apart, over the variance of where it is: 12, were all
 # places alike. Of what several bounds leave the middle is likelier, by 0.23 of its width.
@@ -147,7 +150,7 @@ class _Changes:
         """
         more, shortest = np.abs(self.moved) - 1.0, np.where(means, self.length, self.shortest())
         with np.errstate(invalid="ignore"):
-            beyond = _BETWEEN * np.abs(self._earlier - self.length)
+            beyond = _BETWEEN * self._uneven()
             least = more * (np.minimum(_shifted(shortest), shortest) - beyond) + shortest
             most = more * (np.maximum(self._earlier, self.length) + beyond) + self.length
         known = (more == 0.0) | self.whole | (self.length > 1.0 + _OFF_TICK)
@@ -156,6 +159,15 @@ class _Changes:
     @property
     def _earlier(self) -> FloatArray:
         return _shifted(self.length)
+
+    def _uneven(self) -> FloatArray:
+        """How far intervals next to each other are apart at most, around each and the one before.
+
+        (n,), as long as the interval itself where a turn is among them.
+        """
+        apart = np.pad(np.abs(np.diff(self.length, prepend=np.nan)), 1, constant_values=np.nan)
+        most = np.fmax(np.fmax(apart[:-2], apart[1:-1]), apart[2:])
+        return np.where(np.isfinite(most), most, self.length)
 
     def slowing(self) -> FloatArray:
         """Part of its speed, 0 to 1, that the shaft loses in each interval, (n,).
@@ -212,7 +224,7 @@ class _Intervals:
         agreeing = fits & timed
         # A speed may be a bound where the last edge may be as long ago as it says.
         within = (length <= changes.gap) & (not changes.whole)
-        bound = within & (latest - low >= length - _OFF_TICK)
+        bound = within & (latest - low >= length - _BESIDE)
         turning = within & (np.sign(changes.next_rate) != np.sign(rate)) & (lost > _LOST)
         if changes.whole:  # perhaps within the sample, over an edge and back
             turning = np.append(changes.moved[1:] * changes.moved[:-1] < 0.0, True)
