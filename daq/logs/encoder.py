@@ -153,8 +153,8 @@ class _Changes:
             beyond = _BETWEEN * self._uneven()
             least = more * (np.minimum(_shifted(shortest), shortest) - beyond) + shortest
             most = more * (np.maximum(self._earlier, self.length) + beyond) + self.length
-        known = (more == 0.0) | self.whole | (self.length > 1.0 + _OFF_TICK)
-        return np.where(known, shortest, least), np.where(known, self.length, most)
+        shown = (more == 0.0) | self.whole | (self.length > 1.0 + _OFF_TICK)
+        return np.where(shown, shortest, least), np.where(shown, self.length, most)
 
     @property
     def _earlier(self) -> FloatArray:
