@@ -22,6 +22,7 @@ from daq.errors import Mistake
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 CHANNELS = ("motor", "brake")
 ANALOG_INPUTS = ("current_motor", "current_brake", "torque")

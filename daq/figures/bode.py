@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 
 from daq import notation
 from daq.figures import style
-from daq.hal import FloatArray
+from daq.hal import BoolArray, FloatArray
 
-BoolArray = npt.NDArray[np.bool_]
 ComplexArray = npt.NDArray[np.complex128]
 _MEASURED, _IDENTIFIED = "measured, 95 %", "identified"
 _Z95 = 1.959963984540054

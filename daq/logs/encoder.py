@@ -28,13 +28,11 @@ counts of a sample there are no bounds but in samples without an edge.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from daq.hal import FloatArray, IntArray
-
-BoolArray = npt.NDArray[np.bool_]
+from daq.hal import BoolArray, FloatArray, IntArray
 
 SPEED = "omega"  # the column that a counter's rate makes
 
@@ -128,7 +126,7 @@ class _Changes:
         gain = (self.next_rate - self.rate) * np.sign(self.rate) / (self.pause + self.length)
         with np.errstate(invalid="ignore"):
             gain = np.clip(np.nan_to_num(gain * self.length**2), 0.0, _GROWTH)
-        gain[self.slowing() > 0.0] = 0.0  # where the speed shown may be a bound
+        gain[self.slowing > 0.0] = 0.0  # where the speed shown may be a bound
         most = np.minimum(self.gap, self.length / (1.0 + gain))
         # The edge before came in the sample as well, or not, unless the shaft has turned twice.
         within, before = np.abs(self.moved) > 1.0, (np.abs(self.moved) == 1.0) & self.follows
@@ -139,8 +137,8 @@ class _Changes:
     def shortest(self) -> FloatArray:
         """How long each interval was at least, (n,), if the speed that was shown may be a bound."""
         with np.errstate(invalid="ignore"):
-            bounded = np.minimum(self._earlier, self.length) * (1.0 - self.slowing())
-        return np.where(self.slowing() > 0.0, bounded, self.length)
+            bounded = np.minimum(self._earlier, self.length) * (1.0 - self.slowing)
+        return np.where(self.slowing > 0.0, bounded, self.length)
 
     def between_edges(self, means: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Bounds, (n,) each, of the time from the last edge of the change before to the last one.
@@ -169,6 +167,7 @@ class _Changes:
         most = np.fmax(np.fmax(apart[:-2], apart[1:-1]), apart[2:])
         return np.where(np.isfinite(most), most, self.length)
 
+    @cached_property
     def slowing(self) -> FloatArray:
         """Part of its speed, 0 to 1, that the shaft loses in each interval, (n,).
 
@@ -215,7 +214,7 @@ class _Intervals:
         kept = np.sign(rates[changes.rows - 1]) == np.sign(np.append(0.0, rate[:-1]))
         linked &= kept | (length >= _REST)
         timed = linked & ((length > 1.0 + _OFF_TICK) | changes.whole)
-        lost = changes.slowing()
+        lost = changes.slowing
         linked &= timed | (lost < _SURE)
         bounds = low, high
         for _ in range(_PASSES):

@@ -23,28 +23,33 @@ DT = 1.0 / 800.0  # s
 FINE = 1000  # points of a sample
 
 
-def logged(angle, duration):
-    """Ticks, angles and speeds as a counter shows them that times its edges."""
-    n = round(duration / DT)
+def passed(angle, n):
+    """Counts at n + 1 ticks, times and directions of edges, and which was the last up to each."""
     t = np.arange(n * FINE + 1) * (DT / FINE)
     counts = np.floor(angle(t) / COUNT)
     places = np.flatnonzero(np.diff(counts)) + 1
-    edges, ways = t[places], np.sign(np.diff(counts)[places - 1])
+    # By places, not by times: of an edge at a tick these may differ by rounding.
+    lasts = np.searchsorted(places, np.arange(n + 1) * FINE, side="right") - 1
+    return counts[::FINE], t[places], np.sign(np.diff(counts)[places - 1]), lasts
+
+
+def logged(angle, duration):
+    """Ticks, angles and speeds as a counter shows them that times its edges."""
+    n = round(duration / DT)
+    counts, edges, ways, lasts = passed(angle, n)
     tick, omega = np.arange(n + 1), np.zeros(n + 1)
-    for k, latest in enumerate(np.searchsorted(edges, tick * DT, side="right") - 1):
+    for k, latest in enumerate(lasts):
         if latest < 1 or ways[latest] != ways[latest - 1]:
             continue
         length, silence = edges[latest] - edges[latest - 1], k * DT - edges[latest]
         omega[k] = ways[latest] * COUNT / max(length, silence) * (silence < 0.1)
-    return tick, counts[::FINE] * COUNT, omega
+    return tick, counts * COUNT, omega
 
 
 def logged_by_samples(angle, duration):
     """The same as a counter shows them whose capture unit keeps the last edge alone."""
     tick, theta, _ = logged(angle, duration)
-    t = np.arange(len(tick) * FINE) * (DT / FINE)
-    edges = t[np.flatnonzero(np.diff(np.floor(angle(t) / COUNT))) + 1]
-    lasts = np.searchsorted(edges, tick * DT, side="right") - 1
+    _, edges, _, lasts = passed(angle, len(tick) - 1)
     moved, omega = np.rint(np.diff(theta, prepend=theta[0]) / COUNT), np.zeros(len(tick))
     edge, way, rate = -1.0, 0.0, 0.0
     for k, last in enumerate(lasts):
@@ -163,7 +168,7 @@ def test_a_turn_over_an_edge_and_back_within_a_sample_begins_an_interval(before,
 
 def cornered(t):
     # The speed goes up and down in straight lines between -1.5 and 1.5 rad/s, 23 times a second.
-    u = (t * 23.0 + 0.131) % 1.0
+    u = (t * 23.0 + 0.13) % 1.0
     area = np.where(u < 0.5, u * (u - 0.5), (u - 0.5) * (1.0 - u))
     return 0.21 + 6.0 / 23.0 * area
 
@@ -197,9 +202,7 @@ def test_errors_are_as_large_as_their_variances_say_where_the_speed_has_its_corn
 
 def last_edges(angle, tick):
     """Times of the last edge up to each tick [s], NaN before the first."""
-    t = np.arange(int(tick[-1]) * FINE + 1) * (DT / FINE)
-    edges = t[np.flatnonzero(np.diff(np.floor(angle(t) / COUNT))) + 1]
-    lasts = np.searchsorted(edges, tick * DT, side="right") - 1
+    _, edges, _, lasts = passed(angle, len(tick) - 1)
     return np.where(lasts < 0, np.nan, edges[lasts])
 
 
