@@ -47,8 +47,8 @@ _BETWEEN = 0.1
 _BESIDE = 0.05  # of a sample, from an edge that a bound would tell to where it is
 _PASSES = 4  # from bounds of edges to which speeds are no bounds, and back
 # Square of how far bounds of an edge are apart, over the variance of where it is: 12, were all
-# places alike. Of what several bounds leave the middle is likelier, by 0.23 of its width.
-_NARROWED = 18.0
+# places alike. Of what several bounds leave the middle is likelier.
+_NARROWED = 14.0
 _TINY = 1e-9  # counts a sample, of a shaft that stands
 # Square counts a sample that changes of the speed make of a kind of means; the part that may miss.
 _CLEAR, _ALIKE = 10.0, 0.3

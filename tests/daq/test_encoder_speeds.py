@@ -183,7 +183,7 @@ def test_its_jitter_says_how_far_a_mean_may_be_off(angle):
     error = speeds.values - mean_over(angle, speeds.windows)
     expected = np.abs(slope) * speeds.jitter
     clear = np.isfinite(error) & (expected > 1e-3)
-    assert 0.4 < np.sqrt(np.mean((error[clear] / expected[clear]) ** 2)) < 1.2
+    assert 0.5 < np.sqrt(np.mean((error[clear] / expected[clear]) ** 2)) < 1.1
 
 
 @pytest.mark.parametrize("angle", [swinging, cornered])
@@ -195,8 +195,10 @@ def test_errors_are_as_large_as_their_variances_say_where_the_speed_has_its_corn
         windows=speeds.windows[:, None], jitter=speeds.jitter[:, None],
     )  # fmt: skip
     error = speeds.values - mean_over(angle, speeds.windows)
-    parts = error / np.sqrt(scatter(record)[:, 0] + 0.001**2)
-    assert 0.4 < np.sqrt(np.nanmean(parts**2)) < 1.2
+    variance = scatter(record)[:, 0]
+    parts = error / np.sqrt(variance + 0.001**2)
+    # Most samples of the swing are known to less than what is added.
+    assert 0.5 < np.sqrt(np.nanmean(parts[variance > 0.001**2] ** 2)) < 1.1
     assert np.nanmax(np.abs(parts)) < 5.0
 
 
