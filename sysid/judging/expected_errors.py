@@ -17,6 +17,7 @@ from sysid.engine.simulation import BatchSimulator
 from sysid.fitting.means import Run, each_mean_once, scatter
 from sysid.judging.evidence import independent_of_each
 from sysid.problem.data import Dataset
+from sysid.problem.metrics import mean_known
 from sysid.problem.space import SearchSpace
 from sysid.uncertainty.sensitivity import each_alone
 
@@ -26,6 +27,9 @@ _DRAWS, _MANY = 40, 640
 _ABOVE = 1.25  # of root mean squares in parts of those expected, less than which is let pass
 _STEP = 1e-5  # of a search coordinate, for slopes
 _EVEN = 0.1  # of a mean square, what is not passed on at least
+# Times the mean square of what was left, beyond which a draw is not what has happened; of the draws
+# those that may be, at least, to tell what did.
+_FAR, _LIKE = 9.0, 0.25
 _FINER = 1e-2  # part of the accuracy at which the error of a simulation shows
 
 
@@ -46,7 +50,8 @@ class ExpectedErrors:
     (n_samples, n_outputs, k), errors that go with the inputs, each by one standard deviation of
     what makes it: the sample that a state starts at, the zero of a channel, the simulation, and
     last ``n_directions`` of the parameters. passed_on: (n_samples, n_outputs), variance by noise of
-    inputs at each sample.
+    inputs at each sample, as far as it can have acted: what is left of an unstable motion does not
+    tell of another one, into which more noise would have led.
     """
 
     noise: FloatArray
@@ -221,17 +226,21 @@ def _by_input_noise(
 ) -> tuple[FloatArray, FloatArray]:
     """Squares of each output by noise of the inputs: the mean of each of n draws, of each sample.
 
-    (n, n_outputs) and (n_samples, n_outputs).
+    (n, n_outputs) and (n_samples, n_outputs). Of each sample those of the draws by which an output
+    errs no more than it has, nothing where these are few.
     """
     rng, squares = np.random.default_rng(0), np.zeros((n, undisturbed.shape[1]))
-    each = np.zeros_like(undisturbed)
+    each, count = np.zeros_like(undisturbed), np.zeros(undisturbed.shape[1])
+    most = _FAR * mean_known((record.outputs - undisturbed) ** 2, 0)
     for draw in squares:
         noise = rng.standard_normal(record.inputs.shape) * record.input_noise
         disturbed = runs(vector[None], replace(record, inputs=record.inputs + noise))[0]
         square = (disturbed - undisturbed) ** 2
         draw[:] = np.mean(square, axis=0)
-        each += square / n
-    return squares, each
+        like = draw <= most
+        each += np.where(like, square, 0.0)
+        count += like
+    return squares, np.where(count < _LIKE * n, 0.0, each / np.maximum(count, 1.0))
 
 
 def floor_test(

@@ -106,6 +106,36 @@ def test_a_sum_of_an_inputs_noise_is_as_often_so_large_as_is_told():
     assert 0.2 < np.mean(p_values < 0.3) < 0.4
 
 
+def two_wells() -> ProcessModel:
+    """From nearly between two wells; which of them it falls into, noise decides."""
+    return ProcessModel(
+        name="two wells",
+        states=(State("x", "1"),),
+        inputs=(Input("u", "1"),),
+        outputs=(Output("x", "1"),),
+        parameters=(Parameter("k", "1/s", 20.0, 1.0, 100.0),),
+        derivative=lambda x, u, p: (p[0] * (x[0] - x[0] * x[0] * x[0]) + u[0],),
+    )
+
+
+def test_noise_that_would_have_led_elsewhere_tells_nothing_of_where_errors_are_large():
+    """What is left is the sensor's noise alone, as large at the fall as in the well."""
+    n, rng = 400, np.random.default_rng(6)
+    blank, noise = np.zeros((n, 1)), {"input_noise": np.array([1.0])}
+    model = two_wells()
+    model = replace(model, states=(replace(model.states[0], initial=0.01),))
+    x = BatchSimulator(model).trajectories(model.nominal, Dataset(blank, blank, 0.01), None)[0]
+    record = Dataset(
+        blank, x + 0.01 * rng.standard_normal((n, 1)), 0.01, output_noise=np.array([0.01]), **noise
+    )
+    expected = expected_errors(
+        BatchSimulator(model), SearchSpace.of(model), model.nominal, record, x[0], None
+    )
+    assert expected.variance[0] > 0.5
+    residual = record.outputs - x
+    np.testing.assert_allclose(expected.evened(residual), residual, rtol=0.2)
+
+
 def test_errors_of_zeros_are_expected_and_an_inputs_adds_up():
     n, dt = 400, 0.01
     zeros = {"input_zero": np.array([0.1]), "output_zero": np.array([0.02])}
