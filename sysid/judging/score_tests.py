@@ -82,6 +82,9 @@ _MOST = 5  # findings
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
 _HALF = 0.5  # of the residuals' squares, which other equations at rest leave at most, to be named
+# Times an output's squares, more than which a fit leaves by nothing that is there. Where samples
+# are lost in between, whitened residuals do not tell what is slow.
+_WORSE = 2.0
 # Of what one explains, up to which what another does differs from it and is the same, or nearly.
 _SAME, _NEARLY_SAME = 0.1, 0.7
 _AS_LATE = 0.8  # of what one explains that is early, that counts for as much where it is late
@@ -355,7 +358,9 @@ class _Tests:
             results = self._tested(changes, suspects, left)
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
             likely = [i for i in logs if logs[i] < _LOG_CHANCE]
-            significant = [i for i in likely if self._is_possible(suspects[i], results[i][0])]
+            significant = [
+                i for i in likely if self._is_possible(suspects[i], changes[i], results[i][0])
+            ]
             if not significant:
                 return
             surest = _surest(suspects, {i: (logs[i], results[i][0]) for i in significant})
@@ -440,12 +445,19 @@ class _Tests:
         difference, explained = residual - another, before - another
         return self._squares(difference) < tolerance**2 * self._squares(explained)
 
-    def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
+    def _is_possible(self, suspect: Suspect, changes: FloatArray, result: Regressed) -> bool:
         """Whether it is a fault by its size.
 
         A gain is off by more than what no sensor holds, crosstalk is little, and a parameter that
-        changes stays above zero where physics asks for that.
+        changes stays above zero where physics asks for that. Nothing that is there leaves an output
+        larger errors than it had, whatever the residuals' colour makes of it.
         """
+        admitted = slice(self._ends[0], None)
+        columns = self._columns[..., admitted]
+        before = self._left_by_fit(columns @ self._regression.coefficients[admitted])
+        taken = changes @ result.amplitudes + columns @ result.coefficients[admitted]
+        if np.any(self._left_by_fit(taken) > _WORSE * before):
+            return False
         if suspect.kind == "gain":
             return abs(float(result.amplitudes[0])) > _EXACT
         if suspect.kind == "crosstalk":
@@ -677,6 +689,15 @@ class _Tests:
         within = basis[: taken.size].T @ (taken / self._errors).ravel()
         moved: FloatArray = self._gradients @ -solve_triangular(triangle, within)
         return moved
+
+    def _left_by_fit(self, taken: FloatArray) -> FloatArray:
+        """Squares of each output, (n_outputs,), left by a fit that takes such changes out."""
+        basis, _ = self._fitted
+        basis = basis[: taken.size]
+        target = ((self._residual - taken) / self._errors).ravel()
+        left = (target - basis @ (basis.T @ target)).reshape(taken.shape)
+        squares: FloatArray = np.sum(left**2, axis=0)
+        return squares
 
     @cached_property
     def _errors(self) -> FloatArray:

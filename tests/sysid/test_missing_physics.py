@@ -941,3 +941,20 @@ def test_a_driver_that_opens_between_pulses_is_named(opens):
     reasons = " ".join(verdict.parameters.reasons)
     assert ("another domega/dt while voltage stands at 0" in reasons) == opens
     assert (verdict.trust == "good") != opens
+
+
+def test_a_slow_signal_that_would_leave_larger_errors_is_not_asked_for():
+    """Errors rise between gaps as by a slow signal, and begin anew behind each: there is none."""
+    model, rng, n, dt = lag(), np.random.default_rng(21), 2000, 0.01
+    u = np.repeat(rng.uniform(-1.0, 1.0, n // 20), 20)[:, None]
+    blank = Dataset(u, np.full((n, 1), np.nan), dt)
+    simulator = BatchSimulator(model, accuracy=1e-6)
+    y = simulator.trajectories(model.nominal, blank, None, np.zeros((1, 1)))[0]
+    place = np.arange(n) % 10
+    rising = 0.05 * np.cos(4.0 * np.pi * np.arange(n) / n) * (place - 2.0) * dt
+    y += rising[:, None] + 3e-4 * rng.standard_normal((n, 1))
+    y[place > 4] = np.nan
+    record = replace(blank, outputs=y)
+    estimator = GASSI(model, population=20, generations=3).fit(record)
+    suspicion = suspected(estimator, estimator.uncertainty(record), [record])
+    assert suspicion is not None and not suspicion.findings
