@@ -23,6 +23,7 @@ SingleArray = NDArray[np.float32]
 
 _NEAR = 16  # samples whose errors are alike
 _LOOSE = 1.5  # times what is foretold, by which samples may err
+_BY_CHANCE = 1.5  # times the variance that is foretold, which chance alone may make of draws
 _LEAST = 1e-12  # variance of an error; a smaller one is that of rounding
 
 
@@ -96,7 +97,7 @@ class ErrorFilter:
         """
         squares = np.mean(self.of(errors) ** 2, axis=1).reshape(self.kept.shape)
         squares = uniform_filter1d(squares, _NEAR, axis=0, mode="nearest")
-        larger = np.sqrt(np.maximum(squares, 1.0))
+        larger = np.sqrt(np.where(squares > _BY_CHANCE, squares, 1.0))
         loose = float(np.mean(larger > _LOOSE, axis=0).max())
         return replace(self, kept=self.kept / larger, loose=loose)
 

@@ -5,19 +5,17 @@ output it is F = S' S / r. Where a sample's instant is known to a deviation j on
 record), its error has the variance r + (j dy/dt)^2, the mean of that before and of that after it.
 Starts that a record does not tell take their part of it away; the Schur complement is left.
 
-Noise of a measured input moves the outputs by G n, which is not white. A fit divides each error by
-the variance s = r + var(G n) of its sample (``criterion: compensated`` of an identification). With
-J = S' S / s and the covariance C of S' e / s its estimate scatters by J^-1 C J^-1; what it tells is
-the inverse of that.
+Noise of a measured input moves the outputs by G n, which is not white: V = R + G G' takes the place
+of R, and F = S' V^-1 S. An ``ErrorFilter`` foretells errors from those before, as the filter does
+whose innovations a fit goes by (``criterion: innovations`` of an identification).
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import pinvh
 
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.engine.intervals import Intervals
 from sysid.engine.scheme import LANES
 from sysid.engine.simulation import BatchSimulator
@@ -31,18 +29,13 @@ from sysid.problem.space import SearchSpace
 _PHANTOM = 1e-10
 _FEWER = 3  # times the integration steps there are of what noise does
 _BURST = 1e3  # times its span, by which no output moves over the range of a parameter
-# Share of the largest scatter, of coordinates of like scatter, below which a direction has none.
-_LEAST, _TINY = 1e-9, 1e-300
 
 
 class Informant:
     """Computes what a record would tell of the parameters.
 
     noise: (n_outputs,), standard deviations of the outputs' errors, infinite for one that does not
-    count; input_noise: (n_inputs,), of the white noise on measured inputs. draws: of that noise, at
-    least; up to a block more. Where they are fewer than coordinates they leave directions without
-    noise: of the actuator's 19 in eight runs 16, 29 and 125 draws gave deviations of 0.75, 0.9 and
-    0.98 of those of 253 draws (geometric mean).
+    count; input_noise: (n_inputs,), of the white noise on measured inputs.
     """
 
     def __init__(
@@ -51,10 +44,8 @@ class Informant:
         space: SearchSpace,
         noise: FloatArray,
         input_noise: FloatArray,
-        draws: int = LANES,
     ) -> None:
         self._simulator, self._space, self._noise = simulator, space, noise
-        self._draws = draws
         self._noisy, self._input_noise = np.flatnonzero(input_noise), input_noise
         self._disturbed = simulator
         if len(self._noisy):
@@ -67,21 +58,13 @@ class Informant:
         Of the record only inputs, first samples and jitter count. Not finite where a simulation
         failed.
         """
-        n_free, unknown = len(self._space.index), self._unknown(record)
-        # Draws fill the block that coordinates leave, and blocks of their own.
-        n_draws = -(n_free + len(unknown)) % LANES if len(self._noisy) else 0
-        passes = [self._slopes(record, chromosomes, n_free, unknown, n_draws)]
-        while len(self._noisy) and n_draws < self._draws:
-            passes.append(self._slopes(record, chromosomes, 0, (), LANES, seed=len(passes)))
-            n_draws += LANES
-        slopes = np.concatenate(passes, axis=-1)
-        outputs = self._simulator.trajectories(self._space.full(chromosomes), record)
+        n_free, vectors = len(self._space.index), self._space.full(chromosomes)
+        steps = self._simulator.steps_of_each(vectors, record)
+        slopes = self._slopes(record, chromosomes, steps)
+        outputs = self._simulator.trajectories(vectors, record)
         slopes[self._burst(slopes[..., :n_free], outputs)] = np.nan
-        errors = self.variances(record, outputs)
-        joint = [
-            self._joint(each, scatter, n_free + len(unknown))
-            for each, scatter in zip(slopes, errors, strict=True)
-        ]
+        runs = zip(vectors, outputs, slopes, steps, strict=True)
+        joint = [self._joint(record, *run) for run in runs]
         return np.array([without_starts(each, n_free) for each in joint])
 
     def tangents(
@@ -91,9 +74,11 @@ class Informant:
 
         chromosome: (n_free,). n_steps: integration steps per sample, default what it needs.
         """
-        unknown, n_free = self._unknown(record), len(self._space.index)
-        slopes = self._slopes(record, chromosome[None], n_free, unknown, 0, n_steps)
-        return np.asarray(slopes[0])
+        if n_steps is None:
+            steps = self._simulator.steps_of_each(self._space.full(chromosome[None]), record)
+        else:
+            steps = np.array([n_steps])
+        return np.asarray(self._slopes(record, chromosome[None], steps)[0])
 
     def error_filter(
         self, record: Dataset, vector: FloatArray, outputs: FloatArray, n_steps: int
@@ -113,12 +98,11 @@ class Informant:
         moved += np.sqrt(variances) * np.random.default_rng(0).standard_normal(moved.shape)
         return error_filter.loosened((moved - outputs).reshape(LANES, -1).T)
 
-    def _with_errors(self, record: Dataset, count: int, seed: int = 0) -> Dataset:
+    def _with_errors(self, record: Dataset, count: int) -> Dataset:
         """A record with channels for so many draws of each measured input's noise."""
-        places = self._noisy if count else self._noisy[:0]
-        shape = record.n_samples, len(places), count
-        errors = np.random.default_rng(seed).standard_normal(shape)
-        channels = (errors * self._input_noise[places, None]).reshape(record.n_samples, -1)
+        shape = record.n_samples, len(self._noisy), count
+        errors = np.random.default_rng(0).standard_normal(shape)
+        channels = (errors * self._input_noise[self._noisy, None]).reshape(record.n_samples, -1)
         return replace(
             record,
             inputs=np.hstack([record.inputs, channels]),
@@ -131,41 +115,20 @@ class Informant:
         model = self._simulator.model
         return [i for i in range(len(model.states)) if record.initial_range(model, i)]
 
-    def _slopes(
-        self,
-        record: Dataset,
-        chromosomes: FloatArray,
-        n_free: int,
-        unknown: Sequence[int],
-        n_draws: int,
-        n_steps: int | None = None,
-        seed: int = 0,
-    ) -> FloatArray:
-        """Tangents by search coordinates, unknown starts, and draws of the inputs' noise.
+    def _slopes(self, record: Dataset, chromosomes: FloatArray, steps: IntArray) -> FloatArray:
+        """Tangents by search coordinates and unknown starts.
 
-        n_free: number of the coordinates, or 0 for none. seed: of the draws. (n, n_samples,
-        n_outputs, n_free + n_unknown + n_draws).
+        steps: (n,), of the integration. (n, n_samples, n_outputs, n_free + n_unknown).
         """
-        simulator = self._disturbed if n_draws else self._simulator
-        model, vectors = simulator.model, self._space.full(chromosomes)
-        n, n_starts = len(vectors), len(unknown)
-        n_channels = LANES if n_draws else 0
-        quiet = np.zeros((n, n_channels))
-        along = np.zeros((n, n_free + n_starts + n_draws, len(model.parameters)))
-        along[:, :n_free, : vectors.shape[1]] = self._space.directions(chromosomes)[:, :n_free]
-        along[:, n_free + n_starts :, vectors.shape[1] :] = np.eye(n_draws, n_channels)
-        moved = np.zeros((*along.shape[:2], len(model.states)))
-        moved[:, np.arange(n_starts) + n_free, unknown] = 1.0
-        if n_steps is None:
-            steps = self._simulator.steps_of_each(vectors, record)[:, None]
-        else:
-            steps = np.full((n, 1), n_steps)
+        simulator, vectors = self._simulator, self._space.full(chromosomes)
+        n, n_free, unknown = len(vectors), len(self._space.index), self._unknown(record)
+        along = np.zeros((n, n_free + len(unknown), vectors.shape[1]))
+        along[:, :n_free] = self._space.directions(chromosomes)[:, :n_free]
+        moved = np.zeros((*along.shape[:2], len(simulator.model.states)))
+        moved[:, np.arange(len(unknown)) + n_free, unknown] = 1.0
+        quiet = replace(record, input_zero=np.zeros(0), input_noise=np.zeros(0))
         (slopes,) = simulator.tangents(
-            np.hstack([vectors, quiet]),
-            [self._with_errors(record, n_channels, seed)],
-            along,
-            steps,
-            start_directions=[moved],
+            vectors, [quiet], along, steps[:, None], start_directions=[moved]
         )
         return slopes
 
@@ -191,30 +154,23 @@ class Informant:
         rates = np.diff(outputs, axis=1) / record.dt
         return white + _mean_of_sides(rates**2) * record.jitter**2
 
-    def _joint(self, slopes: FloatArray, errors: FloatArray, n: int) -> FloatArray:
-        """Information of n coordinates and unknown starts together.
+    def _joint(
+        self, record: Dataset, vector: FloatArray, outputs: FloatArray, slopes: FloatArray, n: int
+    ) -> FloatArray:
+        """Information of coordinates and unknown starts together, (p, p).
 
-        slopes: (n_samples, n_outputs, n + n_draws), those by draws of the inputs' noise behind.
-        errors: (n_samples, n_outputs), variances.
+        outputs: (n_samples, n_outputs) under parameters (n_parameters,); slopes: (n_samples,
+        n_outputs, p). n: steps of the integration.
         """
-        counted = np.isfinite(self._noise)
-        of_outputs = errors[:, counted]
-        slopes, changes = slopes[:, counted, :n], slopes[:, counted, n:]
-        n_draws = changes.shape[-1]
-        variances = of_outputs + np.sum(changes**2, axis=-1) / max(n_draws, 1)
-        weighted = slopes / variances[..., None]
-        quiet = (weighted * np.sqrt(of_outputs)[..., None]).reshape(-1, n)
-        weighted, slopes = weighted.reshape(-1, n), slopes.reshape(-1, n)
-        curvature: FloatArray = weighted.T @ slopes
-        if not n_draws or not np.isfinite(curvature).all():
-            return curvature
-        pushes, score = weighted.T @ changes.reshape(-1, n_draws), quiet.T @ quiet
-        scatter = score + pushes @ pushes.T / n_draws
-        # Rounding along what no record tells must not come back divided by next to nothing.
-        size = np.sqrt(np.maximum(np.diag(scatter), _TINY))
-        inverse = pinvh(scatter / np.outer(size, size), rtol=_LEAST)
-        effective: FloatArray = curvature @ (inverse / np.outer(size, size)) @ curvature
-        return effective
+        p = slopes.shape[2]
+        if not (np.isfinite(slopes).all() and np.isfinite(outputs).all()):
+            return np.full((p, p), np.nan)
+        error_filter = self.error_filter(record, vector, outputs, n)
+        if not error_filter.finite:
+            return np.full((p, p), np.nan)
+        whitened = error_filter.of(slopes.reshape(-1, p))
+        joint: FloatArray = whitened.T @ whitened
+        return joint
 
     def null_directions(self, chromosome: FloatArray) -> FloatArray:
         """Directions of the search coordinates that no record tells, (k, n_free), of length one."""
