@@ -26,9 +26,9 @@ from sysid.threads import Workers, available_cores, one_thread
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.ties import named_values
 
-# Runs are searched for by coarser simulations; of those chosen it is told by what was asked for.
-# Times the accuracy, and its end.
-_COARSER, _COARSEST = 10.0, 0.1
+# Runs are searched for by coarser simulations and few draws of the inputs' noise; of those chosen
+# it is told by what was asked for and by many. Times the accuracy, its end, draws.
+_COARSER, _COARSEST, _DRAWS = 10.0, 0.1, 96
 _FEW = 4  # parameter vectors at least that a feedback is tried with, before it is chosen
 
 
@@ -197,7 +197,7 @@ def design(
     simulator = BatchSimulator(model, accuracy=accuracy, threads=1)
     coarse = BatchSimulator(model, accuracy=min(_COARSER * accuracy, _COARSEST), threads=1)
     informant = Informant(coarse, space, *deviations_of(model, noise))
-    exact = Informant(simulator, space, *deviations_of(model, noise))
+    exact = Informant(simulator, space, *deviations_of(model, noise), draws=_DRAWS)
     measured = [name for name in model.output_names if name in noise]
     structure = kept_identifiability(space.as_model().with_outputs(measured))
     wanted = chosen(tuple(targets or quantities), structure, space)

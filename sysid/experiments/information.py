@@ -5,11 +5,14 @@ output it is F = S' S / r. Where a sample's instant is known to a deviation j on
 record), its error has the variance r + (j dy/dt)^2, the mean of that before and of that after it.
 Starts that a record does not tell take their part of it away; the Schur complement is left.
 
-Noise of a measured input moves the outputs by G n, which is not white: V = R + G G' takes the place
-of R, and F = S' V^-1 S. An ``ErrorFilter`` foretells errors from those before, as the filter does
-whose innovations a fit goes by (``criterion: innovations`` of an identification).
+Noise of a measured input moves the outputs by G n, which is not white. Where it is known when the
+outputs are measured a fit goes by the innovations of a filter, and V = R + G G' takes the place of
+R: F = S' V^-1 S, by an ``ErrorFilter`` that foretells errors from those before. Else a fit divides
+each error by the variance s = r + var(G n) of its sample (``compensated``). With J = S' S / s and
+the covariance C of S' e / s its estimate scatters by J^-1 C J^-1; what it tells is the inverse.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +31,8 @@ from sysid.problem.space import SearchSpace
 # Share of the largest information above which a direction that tells nothing is told something.
 _PHANTOM = 1e-10
 _FEWER = 3  # times the integration steps there are of what noise does
+# Share of the largest scatter, of coordinates of like scatter, below which a direction has none.
+_LEAST, _TINY = 1e-9, 1e-300
 _BURST = 1e3  # times its span, by which no output moves over the range of a parameter
 
 
@@ -35,7 +40,10 @@ class Informant:
     """Computes what a record would tell of the parameters.
 
     noise: (n_outputs,), standard deviations of the outputs' errors, infinite for one that does not
-    count; input_noise: (n_inputs,), of the white noise on measured inputs.
+    count; input_noise: (n_inputs,), of the white noise on measured inputs. draws: of that noise, at
+    least, where it is not filtered. Where they are fewer than coordinates they leave directions
+    without noise: of the actuator's 19 in eight runs 16, 29 and 125 draws gave deviations of 0.75,
+    0.9 and 0.98 of those of 253 draws (geometric mean).
     """
 
     def __init__(
@@ -44,8 +52,10 @@ class Informant:
         space: SearchSpace,
         noise: FloatArray,
         input_noise: FloatArray,
+        draws: int = 2 * LANES,
     ) -> None:
         self._simulator, self._space, self._noise = simulator, space, noise
+        self._blocks = -(-draws // LANES)
         self._noisy, self._input_noise = np.flatnonzero(input_noise), input_noise
         self._disturbed = simulator
         if len(self._noisy):
@@ -63,8 +73,10 @@ class Informant:
         slopes = self._slopes(record, chromosomes, steps)
         outputs = self._simulator.trajectories(vectors, record)
         slopes[self._burst(slopes[..., :n_free], outputs)] = np.nan
+        timed = record.jitter.any() or record.windows.size
+        told = self._by_filter if timed or not len(self._noisy) else self._by_compensation
         runs = zip(vectors, outputs, slopes, steps, strict=True)
-        joint = [self._joint(record, *run) for run in runs]
+        joint = [told(record, *run) if _are_finite(run) else _nowhere(run) for run in runs]
         return np.array([without_starts(each, n_free) for each in joint])
 
     def tangents(
@@ -93,15 +105,23 @@ class Informant:
         intervals = Intervals(model, vector, record.inputs, record.dt, -(-n_steps // _FEWER))
         states = intervals.run(record.initial_state(model))
         error_filter = ErrorFilter.along(intervals, states, variances, self._input_noise)
-        vectors = np.hstack([np.tile(vector, (LANES, 1)), np.eye(LANES)])
-        moved = self._disturbed.trajectories(vectors, self._with_errors(record, LANES), n_steps)
+        moved = self._pushes(record, vector, outputs, n_steps)
         moved += np.sqrt(variances) * np.random.default_rng(0).standard_normal(moved.shape)
-        return error_filter.loosened((moved - outputs).reshape(LANES, -1).T)
+        return error_filter.loosened(moved.reshape(LANES, -1).T)
 
-    def _with_errors(self, record: Dataset, count: int) -> Dataset:
+    def _pushes(
+        self, record: Dataset, vector: FloatArray, outputs: FloatArray, n_steps: int, seed: int = 0
+    ) -> FloatArray:
+        """What draws of the inputs' noise change in outputs, (LANES, n_samples, n_outputs)."""
+        vectors = np.hstack([np.tile(vector, (LANES, 1)), np.eye(LANES)])
+        errors = self._with_errors(record, LANES, seed)
+        moved: FloatArray = self._disturbed.trajectories(vectors, errors, n_steps) - outputs
+        return moved
+
+    def _with_errors(self, record: Dataset, count: int, seed: int) -> Dataset:
         """A record with channels for so many draws of each measured input's noise."""
         shape = record.n_samples, len(self._noisy), count
-        errors = np.random.default_rng(0).standard_normal(shape)
+        errors = np.random.default_rng(seed).standard_normal(shape)
         channels = (errors * self._input_noise[self._noisy, None]).reshape(record.n_samples, -1)
         return replace(
             record,
@@ -154,7 +174,7 @@ class Informant:
         rates = np.diff(outputs, axis=1) / record.dt
         return white + _mean_of_sides(rates**2) * record.jitter**2
 
-    def _joint(
+    def _by_filter(
         self, record: Dataset, vector: FloatArray, outputs: FloatArray, slopes: FloatArray, n: int
     ) -> FloatArray:
         """Information of coordinates and unknown starts together, (p, p).
@@ -162,15 +182,35 @@ class Informant:
         outputs: (n_samples, n_outputs) under parameters (n_parameters,); slopes: (n_samples,
         n_outputs, p). n: steps of the integration.
         """
-        p = slopes.shape[2]
-        if not (np.isfinite(slopes).all() and np.isfinite(outputs).all()):
-            return np.full((p, p), np.nan)
-        error_filter = self.error_filter(record, vector, outputs, n)
+        p, error_filter = slopes.shape[2], self.error_filter(record, vector, outputs, n)
         if not error_filter.finite:
             return np.full((p, p), np.nan)
         whitened = error_filter.of(slopes.reshape(-1, p))
         joint: FloatArray = whitened.T @ whitened
         return joint
+
+    def _by_compensation(
+        self, record: Dataset, vector: FloatArray, outputs: FloatArray, slopes: FloatArray, n: int
+    ) -> FloatArray:
+        """The same as a fit scatters that divides each error by its deviation."""
+        counted, p = np.isfinite(self._noise), slopes.shape[2]
+        of_outputs = self.variances(record, outputs[None])[0][:, counted]
+        seeds = range(self._blocks)
+        pushes = np.concatenate([self._pushes(record, vector, outputs, n, seed) for seed in seeds])
+        if not np.isfinite(pushes).all():
+            return np.full((p, p), np.nan)
+        pushes, slopes = pushes[..., counted], slopes[:, counted].reshape(-1, p)
+        variances = of_outputs + np.mean(pushes**2, axis=0)
+        weighted = slopes / variances.reshape(-1, 1)
+        quiet = weighted * np.sqrt(of_outputs).reshape(-1, 1)
+        curvature = weighted.T @ slopes
+        scores = weighted.T @ pushes.reshape(len(pushes), -1).T
+        scatter = quiet.T @ quiet + scores @ scores.T / len(pushes)
+        # Rounding along what no record tells must not come back divided by next to nothing.
+        size = np.sqrt(np.maximum(np.diag(scatter), _TINY))
+        inverse = pinvh(scatter / np.outer(size, size), rtol=_LEAST)
+        effective: FloatArray = curvature @ (inverse / np.outer(size, size)) @ curvature
+        return effective
 
     def null_directions(self, chromosome: FloatArray) -> FloatArray:
         """Directions of the search coordinates that no record tells, (k, n_free), of length one."""
@@ -190,6 +230,17 @@ class Informant:
         moving = lengths[:, 0] > 0.0
         normed: FloatArray = directions[moving] / lengths[moving]
         return normed
+
+
+def _are_finite(run: Sequence[FloatArray]) -> bool:
+    """Whether a simulation, its outputs and its slopes, has come to its end."""
+    return all(bool(np.isfinite(part).all()) for part in run)
+
+
+def _nowhere(run: Sequence[FloatArray]) -> FloatArray:
+    """What a run that has failed tells, of coordinates and starts: nothing is known of that."""
+    p = run[2].shape[2]
+    return np.full((p, p), np.nan)
 
 
 def tells_nothing_there(information: FloatArray, null: FloatArray) -> bool:

@@ -104,16 +104,38 @@ def test_a_start_that_is_unknown_takes_its_part_of_the_information():
     assert information[np.ix_([0, 2], [0, 2])] == pytest.approx(exact, rel=1e-9)
 
 
-@pytest.mark.parametrize("size", [0.3, 0.01])
-def test_noise_of_an_input_counts_as_the_covariance_that_it_makes(size):
-    slopes, n = responses_to_step()[:, :2], 60
+def pushed_step(n=60):
+    """Slopes as of ``responses_to_step``, and the response to an input's errors, (n, n)."""
     decay = np.exp(-DT / 0.2)
-    # The response to a held input's errors, sample by sample.
+    # To those of a held input, sample by sample.
     lags = np.subtract.outer(np.arange(n), np.arange(n)) - 1
     response = np.where(lags >= 0, 3.0 * (1.0 - decay) * decay ** np.maximum(lags, 0), 0.0)
-    covariance = NOISE["y"] ** 2 * np.eye(n) + size**2 * response @ response.T
+    return responses_to_step(n)[:, :2], response
+
+
+@pytest.mark.soak
+def test_noise_of_an_input_counts_as_a_fit_that_compensates_it_scatters():
+    (slopes, response), n, sigma = pushed_step(), 60, 0.3
+    variances = NOISE["y"] ** 2 + sigma**2 * np.sum(response**2, axis=1)
+    weighted = slopes / variances[:, None]
+    rng = np.random.default_rng(1)
+    errors = sigma * rng.standard_normal((20_000, n)) @ response.T
+    errors += NOISE["y"] * rng.standard_normal(errors.shape)
+    estimates = errors @ weighted @ np.linalg.inv(slopes.T @ weighted)
+    information = information_of_step(lag(), sigma)[np.ix_([0, 2], [0, 2])]
+    predicted = np.sqrt(np.diag(np.linalg.inv(information)))
+    assert predicted == pytest.approx(estimates.std(axis=0), rel=0.15)
+    without = np.linalg.inv(information_of_step(lag())[np.ix_([0, 2], [0, 2])])
+    assert np.all(predicted > 3.0 * np.sqrt(np.diag(without)))
+
+
+@pytest.mark.parametrize("size", [0.3, 0.01])
+def test_where_it_is_known_when_outputs_are_measured_a_filter_takes_an_inputs_noise_out(size):
+    """Then what is told is what the errors' covariance leaves; jitter that is next to none."""
+    slopes, response = pushed_step()
+    covariance = NOISE["y"] ** 2 * np.eye(len(slopes)) + size**2 * response @ response.T
     exact = slopes.T @ np.linalg.solve(covariance, slopes)
-    information = information_of_step(lag(), size)[np.ix_([0, 2], [0, 2])]
+    information = information_of_step(lag(), size, jitter=1e-9)[np.ix_([0, 2], [0, 2])]
     assert information == pytest.approx(exact, rel=1e-6)
     assert np.all(np.diag(exact) < 0.99 * np.diag(slopes.T @ slopes) / NOISE["y"] ** 2)
 
