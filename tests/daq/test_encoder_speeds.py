@@ -227,6 +227,34 @@ def test_edges_are_timed_by_those_before_and_behind_them():
     assert abs(np.mean(late)) < 0.03
 
 
+def on_uneven_wheel(angle, off):
+    """The angle by edges that are off their places by parts of a count, over and over."""
+    off = np.array(off)
+
+    def seen(t):
+        counts = angle(t) / COUNT
+        place = np.floor(counts).astype(int)
+        low, high = place + off[place % len(off)], place + 1 + off[(place + 1) % len(off)]
+        return (place - (counts < low) + (counts >= high) + 0.5) * COUNT
+
+    return seen
+
+
+@pytest.mark.parametrize("angle", [swinging, surging])
+def test_edges_that_are_unevenly_cut_make_speeds_err_by_that_and_no_more(angle):
+    off = 0.0, 0.08, -0.05, 0.06
+    uneven = np.sqrt(np.mean(np.diff(off, append=off[0]) ** 2))  # of a count between two edges
+    tick, theta, omega = logged(on_uneven_wheel(angle, off), 1.2)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT)
+    error = speeds.values - mean_over(angle, speeds.windows)
+    fast = np.abs(speeds.values) > 0.2
+    parts = error[fast] / speeds.values[fast]
+    assert np.isnan(speeds.values).mean() < 0.01
+    assert 0.8 * uneven < np.sqrt(np.mean(parts**2)) < 1.1 * uneven
+    even = mean_speeds(*logged(angle, 1.2), DT, COUNT)
+    assert np.sqrt(np.mean(speeds.jitter**2)) > 2.0 * np.sqrt(np.mean(even.jitter**2))
+
+
 def test_a_speed_that_is_a_bound_is_told_from_one_that_is_none():
     """The edge came as long ago as the bound says, though the next speed shown is no less."""
 
