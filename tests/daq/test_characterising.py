@@ -92,6 +92,13 @@ def test_the_intervals_hold_what_the_simulated_rig_is_made_of(finished):
     assert all(determined[name]["width"] < 0.1 for name in ("R_m", "K_m"))
 
 
+def test_intervals_come_out_as_they_were_predicted(finished):
+    """By noise as the fit's filter has it: a compensated fit's would be half as wide again."""
+    last = rounds_of(finished[0] / "c")[-1]
+    ratios = [i.width / i.expected for i in last.intervals() if i.width]
+    assert len(ratios) > 1 and all(0.8 < ratio < 1.25 for ratio in ratios)
+
+
 def test_what_the_model_may_lack_is_tested_at_the_end(finished):
     *before, last = rounds_of(finished[0] / "c")
     assert "missing" in last.result
