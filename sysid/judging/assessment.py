@@ -56,6 +56,7 @@ _STRUCTURE_UNTESTED = (
     "by more than their intervals."
 )
 _PARAMETER_PRAISE = "Nothing was found missing that would move a parameter beyond its interval."
+_SURELY = 1e-5  # probability above which a function that a fit has no use for was chance
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
 
@@ -216,12 +217,14 @@ def judge(
         missing = [f for f in missing if f.kind not in ("bend", "function", "disturbance")]
     if any(fault.kind == "lag" for fault in doubts):
         missing = [f for f in missing if not f.comes_late]  # the same, seen less sharply
+    in_vain = None if alternative is None or alternative.better else alternative
+    by_chance = [f for f in missing if _is_of(f, in_vain) and f.p_value > _SURELY]
+    missing = [f for f in missing if f not in by_chance]
     counting = [f for f in missing if f.counts]
     if not counting and _moved_together(missing) > MOVED:
         counting = missing
-    in_vain = None if alternative is None or alternative.better else alternative
     light += [
-        _moving(f) if in_vain is None or f.term not in in_vain.terms else _in_vain(f, in_vain)
+        _in_vain(f, in_vain) if in_vain is not None and _is_of(f, in_vain) else _moving(f)
         for f in counting
     ]
     if predicted.trust != "poor":  # which is more than these can say
@@ -242,6 +245,7 @@ def judge(
     slight = "; ".join(description(f) for f in missing if f not in counting)
     moving = f"Found, but moving no parameter by {MOVED:g} standard deviations: {slight}."
     notes = [moving] if slight else []
+    notes += map(_after_all, by_chance)
     notes += [fault.sentence for fault in spoilt if fault.part == "validation"]
     notes += map(_not_seen, unseen)
     return Verdict(predicted, parameters, (*notes, *_untested(model, judged, uncertainty)))
@@ -690,6 +694,20 @@ def _in_vain(finding: Finding, fitted: Alternative) -> str:
         f"What is left looks like {description(finding)} ({_chance(finding)}), but fitted with it "
         f"the model {explains}: something else is missing, and parameters may be "
         "off by more than their intervals."
+    )
+
+
+def _is_of(finding: Finding, fitted: Alternative | None) -> bool:
+    """Whether it is the function that was fitted, or one of those that look like it."""
+    terms = () if fitted is None else fitted.terms
+    return any(term in terms for term in (finding.term, *finding.rivals))
+
+
+def _after_all(finding: Finding) -> str:
+    """Note: a function that is hardly surer than chance makes one, and that its fit refutes."""
+    return (
+        f"What is left looks like {description(finding)} ({_chance(finding)}), but fitted with it "
+        "the model explains the data no better: so it looks at times by chance."
     )
 
 

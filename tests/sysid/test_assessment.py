@@ -425,6 +425,16 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
         "1e-06), but fitted with it the model explains the data no better: something else is "
         "missing, and parameters may be off by more than their intervals.",
     )
+    # Once in a thousand logs something looks like that by chance.
+    doubtful = replace(finding("function", 3.0), term=term, p_value=7e-4)
+    chance = found([doubtful], replace(added, better=False))
+    assert chance.trust == "good"
+    assert chance.notes[0].endswith("no better: so it looks at times by chance.")
+    assert found([doubtful]).parameters.trust == found([doubtful], added).parameters.trust
+    assert found([doubtful]).parameters.trust == "limited"
+    # So it is where a function of another shape was fitted in its place.
+    shaped = replace(doubtful, term=replace(term, shape="cube"), rivals=(term,))
+    assert found([shaped], replace(added, better=False)).trust == "good"
     # What training has better and validation worse is no term of the plant's either.
     validated = replace(
         added,
