@@ -74,9 +74,9 @@ class Informant:
         outputs = self._simulator.trajectories(vectors, record)
         slopes[self._burst(slopes[..., :n_free], outputs)] = np.nan
         timed = record.jitter.any() or record.windows.size
-        told = self._by_filter if timed or not len(self._noisy) else self._by_compensation
+        joint_of = self._by_filter if timed or not len(self._noisy) else self._by_compensation
         runs = zip(vectors, outputs, slopes, steps, strict=True)
-        joint = [told(record, *run) if _are_finite(run) else _nowhere(run) for run in runs]
+        joint = [joint_of(record, *run) if _are_finite(run) else _nowhere(run) for run in runs]
         return np.array([without_starts(each, n_free) for each in joint])
 
     def tangents(

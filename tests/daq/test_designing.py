@@ -228,7 +228,8 @@ def test_what_the_model_is_given_of_a_run_is_what_the_rig_would_log(tmp_path):
 
 @pytest.mark.soak
 def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path):
-    done = rig("design", asked, "--out", "d", "--json", cwd=tmp_path)
+    noisy = "--set", "noise.torque=0.05"
+    done = rig("design", asked, "--out", "d", "--json", *noisy, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert json.loads((tmp_path / "d" / "design.json").read_text("utf-8")) == document
@@ -237,7 +238,7 @@ def test_a_design_writes_runs_a_figure_and_what_they_would_tell(asked, tmp_path)
     assert by_name.keys() == {"R_m", "K_m", "B_m"}
     assert by_name["K_m"]["target"] == 0.01
     assert all(q["after"] < q["before"] for q in document["quantities"])
-    # All else is fixed: nothing is tied, and B_m alone is hardly felt.
+    # All else is fixed: nothing is tied, and B_m alone is hardly felt under so much noise.
     assert [u["names"] for u in document["unknown"]] == [["B_m"]] and not document["otherwise"]
     for run in document["runs"]:
         checked = rig("check", run["file"], "--json", cwd=tmp_path)
