@@ -195,6 +195,8 @@ def raised_in(kind: type, error: BaseException) -> str:
 
     Empty where it passed through none, or where the class comes with this program.
     """
+    if kind.__module__.partition(".")[0] in _PACKAGES:
+        return ""
     try:
         file = Path(inspect.getfile(kind)).resolve()
     except (OSError, TypeError):
