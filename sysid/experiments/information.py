@@ -76,7 +76,7 @@ class Informant:
         timed = record.jitter.any() or record.windows.size
         joint_of = self._by_filter if timed or not len(self._noisy) else self._by_compensation
         runs = zip(vectors, outputs, slopes, steps, strict=True)
-        joint = [joint_of(record, *run) if _are_finite(run) else _nowhere(run) for run in runs]
+        joint = [joint_of(record, *run) if _are_finite(run) else _nothing(run[2]) for run in runs]
         return np.array([without_starts(each, n_free) for each in joint])
 
     def tangents(
@@ -114,13 +114,13 @@ class Informant:
     ) -> FloatArray:
         """What draws of the inputs' noise change in outputs, (LANES, n_samples, n_outputs)."""
         vectors = np.hstack([np.tile(vector, (LANES, 1)), np.eye(LANES)])
-        errors = self._with_errors(record, LANES, seed)
+        errors = self._with_errors(record, seed)
         moved: FloatArray = self._disturbed.trajectories(vectors, errors, n_steps) - outputs
         return moved
 
-    def _with_errors(self, record: Dataset, count: int, seed: int) -> Dataset:
-        """A record with channels for so many draws of each measured input's noise."""
-        shape = record.n_samples, len(self._noisy), count
+    def _with_errors(self, record: Dataset, seed: int) -> Dataset:
+        """A record with channels for a block of draws of each measured input's noise."""
+        shape = record.n_samples, len(self._noisy), LANES
         errors = np.random.default_rng(seed).standard_normal(shape)
         channels = (errors * self._input_noise[self._noisy, None]).reshape(record.n_samples, -1)
         return replace(
@@ -146,9 +146,8 @@ class Informant:
         along[:, :n_free] = self._space.directions(chromosomes)[:, :n_free]
         moved = np.zeros((*along.shape[:2], len(simulator.model.states)))
         moved[:, np.arange(len(unknown)) + n_free, unknown] = 1.0
-        quiet = replace(record, input_zero=np.zeros(0), input_noise=np.zeros(0))
         (slopes,) = simulator.tangents(
-            vectors, [quiet], along, steps[:, None], start_directions=[moved]
+            vectors, [record], along, steps[:, None], start_directions=[moved]
         )
         return slopes
 
@@ -182,10 +181,10 @@ class Informant:
         outputs: (n_samples, n_outputs) under parameters (n_parameters,); slopes: (n_samples,
         n_outputs, p). n: steps of the integration.
         """
-        p, error_filter = slopes.shape[2], self.error_filter(record, vector, outputs, n)
+        error_filter = self.error_filter(record, vector, outputs, n)
         if not error_filter.finite:
-            return np.full((p, p), np.nan)
-        whitened = error_filter.of(slopes.reshape(-1, p))
+            return _nothing(slopes)
+        whitened = error_filter.of(slopes.reshape(-1, slopes.shape[2]))
         joint: FloatArray = whitened.T @ whitened
         return joint
 
@@ -198,7 +197,7 @@ class Informant:
         seeds = range(self._blocks)
         pushes = np.concatenate([self._pushes(record, vector, outputs, n, seed) for seed in seeds])
         if not np.isfinite(pushes).all():
-            return np.full((p, p), np.nan)
+            return _nothing(slopes)
         pushes, slopes = pushes[..., counted], slopes[:, counted].reshape(-1, p)
         variances = of_outputs + np.mean(pushes**2, axis=0)
         weighted = slopes / variances.reshape(-1, 1)
@@ -237,10 +236,9 @@ def _are_finite(run: Sequence[FloatArray]) -> bool:
     return all(bool(np.isfinite(part).all()) for part in run)
 
 
-def _nowhere(run: Sequence[FloatArray]) -> FloatArray:
-    """What a run that has failed tells, of coordinates and starts: nothing is known of that."""
-    p = run[2].shape[2]
-    return np.full((p, p), np.nan)
+def _nothing(slopes: FloatArray) -> FloatArray:
+    """What a run that has failed tells of coordinates and starts: nothing is known of that."""
+    return np.full((slopes.shape[2],) * 2, np.nan)
 
 
 def tells_nothing_there(information: FloatArray, null: FloatArray) -> bool:

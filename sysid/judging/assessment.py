@@ -218,8 +218,11 @@ def judge(
     if any(fault.kind == "lag" for fault in doubts):
         missing = [f for f in missing if not f.comes_late]  # the same, seen less sharply
     in_vain = None if alternative is None or alternative.better else alternative
-    by_chance = [f for f in missing if _is_of(f, in_vain) and f.p_value > _SURELY]
-    missing = [f for f in missing if f not in by_chance]
+    by_chance = list[str]()
+    if in_vain is not None:
+        refuted = [f for f in missing if _is_of(f, in_vain) and f.p_value > _SURELY]
+        missing = [f for f in missing if f not in refuted]
+        by_chance = [f"{_refuted(f, in_vain)}: so it looks at times by chance." for f in refuted]
     counting = [f for f in missing if f.counts]
     if not counting and _moved_together(missing) > MOVED:
         counting = missing
@@ -245,7 +248,7 @@ def judge(
     slight = "; ".join(description(f) for f in missing if f not in counting)
     moving = f"Found, but moving no parameter by {MOVED:g} standard deviations: {slight}."
     notes = [moving] if slight else []
-    notes += map(_after_all, by_chance)
+    notes += by_chance
     notes += [fault.sentence for fault in spoilt if fault.part == "validation"]
     notes += map(_not_seen, unseen)
     return Verdict(predicted, parameters, (*notes, *_untested(model, judged, uncertainty)))
@@ -678,8 +681,8 @@ def _not_seen(unseen: Unseen) -> str:
     )
 
 
-def _in_vain(finding: Finding, fitted: Alternative) -> str:
-    """Reason: a function by which something shows that it is not, as its fit says."""
+def _refuted(finding: Finding, fitted: Alternative) -> str:
+    """What is left looks like a function that is not there, as its fit says."""
     worse = ", ".join(
         f"{name} {old:.0f} -> {new:.0f} %"
         for name, (old, new) in fitted.fits.items()
@@ -692,23 +695,21 @@ def _in_vain(finding: Finding, fitted: Alternative) -> str:
             explains = "cannot be simulated on validation, where it grows beyond all bounds"
     return (
         f"What is left looks like {description(finding)} ({_chance(finding)}), but fitted with it "
-        f"the model {explains}: something else is missing, and parameters may be "
+        f"the model {explains}"
+    )
+
+
+def _in_vain(finding: Finding, fitted: Alternative) -> str:
+    """Reason: a function that is refuted, by which something else shows."""
+    return (
+        f"{_refuted(finding, fitted)}: something else is missing, and parameters may be "
         "off by more than their intervals."
     )
 
 
-def _is_of(finding: Finding, fitted: Alternative | None) -> bool:
+def _is_of(finding: Finding, fitted: Alternative) -> bool:
     """Whether it is the function that was fitted, or one of those that look like it."""
-    terms = () if fitted is None else fitted.terms
-    return any(term in terms for term in (finding.term, *finding.rivals))
-
-
-def _after_all(finding: Finding) -> str:
-    """Note: a function that is hardly surer than chance makes one, and that its fit refutes."""
-    return (
-        f"What is left looks like {description(finding)} ({_chance(finding)}), but fitted with it "
-        "the model explains the data no better: so it looks at times by chance."
-    )
+    return any(term in fitted.terms for term in (finding.term, *finding.rivals))
 
 
 def _chance(finding: Finding) -> str:

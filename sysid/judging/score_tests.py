@@ -358,8 +358,14 @@ class _Tests:
             results = self._tested(changes, suspects, left)
             logs = {i: result.log_p + np.log(tests) for i, (result, _) in results.items()}
             likely = [i for i in logs if logs[i] < _LOG_CHANCE]
+            if not likely:
+                return
+            before = self._left_by_fit(self._of_admitted(self._regression.coefficients))
             significant = [
-                i for i in likely if self._is_possible(suspects[i], changes[i], results[i][0])
+                i
+                for i in likely
+                if self._is_possible(suspects[i], results[i][0])
+                and not self._is_worse(changes[i], results[i][0], before)
             ]
             if not significant:
                 return
@@ -445,19 +451,27 @@ class _Tests:
         difference, explained = residual - another, before - another
         return self._squares(difference) < tolerance**2 * self._squares(explained)
 
-    def _is_possible(self, suspect: Suspect, changes: FloatArray, result: Regressed) -> bool:
+    def _is_worse(self, changes: FloatArray, result: Regressed, before: FloatArray) -> bool:
+        """Whether a fit with a suspect leaves an output larger errors than it had.
+
+        Nothing that is there does, whatever the residuals' colour makes of it. before: squares that
+        are left without it, (n_outputs,).
+        """
+        taken = changes @ result.amplitudes + self._of_admitted(result.coefficients)
+        return bool(np.any(self._left_by_fit(taken) > _WORSE * before))
+
+    def _of_admitted(self, coefficients: FloatArray) -> FloatArray:
+        """What the suspects that are admitted take out, by coefficients of all columns."""
+        admitted = slice(self._ends[0], None)
+        taken: FloatArray = self._columns[..., admitted] @ coefficients[admitted]
+        return taken
+
+    def _is_possible(self, suspect: Suspect, result: Regressed) -> bool:
         """Whether it is a fault by its size.
 
         A gain is off by more than what no sensor holds, crosstalk is little, and a parameter that
-        changes stays above zero where physics asks for that. Nothing that is there leaves an output
-        larger errors than it had, whatever the residuals' colour makes of it.
+        changes stays above zero where physics asks for that.
         """
-        admitted = slice(self._ends[0], None)
-        columns = self._columns[..., admitted]
-        before = self._left_by_fit(columns @ self._regression.coefficients[admitted])
-        taken = changes @ result.amplitudes + columns @ result.coefficients[admitted]
-        if np.any(self._left_by_fit(taken) > _WORSE * before):
-            return False
         if suspect.kind == "gain":
             return abs(float(result.amplitudes[0])) > _EXACT
         if suspect.kind == "crosstalk":
@@ -679,9 +693,7 @@ class _Tests:
 
         Not by the whitened residuals': these may weigh what the estimate hardly counts.
         """
-        admitted = slice(self._ends[0], None)
-        taken = changes @ result.amplitudes
-        return self._moved_by(taken + self._columns[..., admitted] @ result.move[admitted])
+        return self._moved_by(changes @ result.amplitudes + self._of_admitted(result.move))
 
     def _moved_by(self, taken: FloatArray) -> FloatArray:
         """By how much each estimate moves where a fit takes such changes out of the residuals."""

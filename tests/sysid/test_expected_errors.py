@@ -110,7 +110,7 @@ def two_wells() -> ProcessModel:
     """From nearly between two wells; which of them it falls into, noise decides."""
     return ProcessModel(
         name="two wells",
-        states=(State("x", "1"),),
+        states=(State("x", "1", initial=0.01),),
         inputs=(Input("u", "1"),),
         outputs=(Output("x", "1"),),
         parameters=(Parameter("k", "1/s", 20.0, 1.0, 100.0),),
@@ -123,7 +123,6 @@ def test_noise_that_would_have_led_elsewhere_tells_nothing_of_where_errors_are_l
     n, rng = 400, np.random.default_rng(6)
     blank, noise = np.zeros((n, 1)), {"input_noise": np.array([1.0])}
     model = two_wells()
-    model = replace(model, states=(replace(model.states[0], initial=0.01),))
     x = BatchSimulator(model).trajectories(model.nominal, Dataset(blank, blank, 0.01), None)[0]
     record = Dataset(
         blank, x + 0.01 * rng.standard_normal((n, 1)), 0.01, output_noise=np.array([0.01]), **noise
