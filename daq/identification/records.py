@@ -399,11 +399,13 @@ def _from_log(
     dataset = _dataset(log.path, model, inputs[rows], outputs[rows], tick[rows], log.dt, title)
     dataset = replace(dataset, begin=float(columns["t"][rows][0]))
     if speeds is not None:
-        windows, jitter = np.zeros((*dataset.outputs.shape, 2)), np.zeros(dataset.outputs.shape)
+        shape = dataset.outputs.shape
+        windows, jitter, colour = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape)
         places = tick[rows] - tick[rows][0]
         windows[places] = np.where(speed[:, None], speeds.windows[rows][:, None], 0.0)
         jitter[places] = np.where(speed, speeds.jitter[rows][:, None], 0.0)
-        dataset = replace(dataset, windows=windows, jitter=jitter)
+        colour[places] = np.where(speed, speeds.colour[rows][:, None], 0.0)
+        dataset = replace(dataset, windows=windows, jitter=jitter, jitter_colour=colour)
     return dataset
 
 

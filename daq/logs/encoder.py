@@ -49,6 +49,9 @@ _PASSES = 4  # from bounds of edges to which speeds are no bounds, and back
 # Square of how far bounds of an edge are apart, over the variance of where it is: 12, were all
 # places alike. Of what several bounds leave the middle is likelier.
 _NARROWED = 14.0
+# Correlation of when two edges were with no slack in between, and by what slack squared, over the
+# product of how far their bounds are apart, makes it less; correlations that are none.
+_FIRM, _LOOSER, _NO_PART = 0.95, 4.5, 1e-3
 _TINY = 1e-9  # counts a sample, of a shaft that stands
 # Square counts a sample that changes of the speed make of a kind of means; the part that may miss.
 _CLEAR, _ALIKE = 10.0, 0.3
@@ -66,12 +69,14 @@ class MeanSpeeds:
     values: (n,) [rad/s], NaN for samples between edges of which none was timed, and where the
     shaft turned round amid several edges of a sample, or time and again. windows: (n, 2),
     begin and end of what each is the mean over [s], from its sample on. jitter: (n,), standard
-    deviations of when they were [s].
+    deviations of when they were [s]; colour: (n,), the part of the mean before in these errors,
+    correlations of 0 to 1.
     """
 
     values: FloatArray
     windows: FloatArray
     jitter: FloatArray
+    colour: FloatArray
 
 
 @dataclass(frozen=True)
@@ -195,6 +200,7 @@ class _Intervals:
     begin: FloatArray
     end: FloatArray
     deviation: FloatArray  # by which it may lie earlier or later
+    colour: FloatArray  # part of the deviation of the one before in it
     checked: int  # those whose length and edges can be compared
     agreeing: int  # of them
 
@@ -203,10 +209,10 @@ class _Intervals:
         """rates: in counts per tick."""
         changes = _Changes.of(tick, counts, rates, whole)
         rate, length, latest = changes.rate, changes.length, changes.latest
-        least, most = changes.waits()
-        wait = _waits_by_silence(tick, rates, changes, most)
+        soonest, longest = changes.waits()
+        wait = _waits_by_silence(tick, rates, changes, longest)
         heard = np.isfinite(wait)
-        low, high = latest - np.where(heard, wait, most), latest - np.where(heard, wait, least)
+        low, high = (latest - np.where(heard, wait, waited) for waited in (longest, soonest))
         # An interval begins with the edge that ended the one before; the first row is no edge.
         linked = np.isfinite(length) & changes.follows
         linked[:2] = False
@@ -219,7 +225,8 @@ class _Intervals:
         bounds = low, high
         for _ in range(_PASSES):
             means = timed | (lost == 0.0) | (latest - low < length - _OFF_TICK)
-            low, high, fits = _linked(*bounds, *changes.between_edges(means), linked)
+            least, most = changes.between_edges(means)
+            low, high, fits = _linked(*bounds, least, most, linked)
         agreeing = fits & timed
         # A speed may be a bound where the last edge may be as long ago as it says.
         within = (length <= changes.gap) & (not changes.whole)
@@ -242,8 +249,10 @@ class _Intervals:
         lasting = ~repeated(turns) | (end - begin >= _REST)
         measured = back & (_faster(rate) < 1.0) & lasting
         speed = np.where((bound & heard) | turning | (turns & ~measured), np.nan, rate)
+        slack = np.subtract(most, least, out=np.full(len(rate), np.inf), where=fits)
+        colour = _colour(high - low, slack, np.isfinite(speed))
         counted = int(timed.sum()), int(agreeing.sum())
-        return cls(changes.rows, speed, begin, end, deviation, *counted)
+        return cls(changes.rows, speed, begin, end, deviation, colour, *counted)
 
     def show_edges(self, stated: bool) -> bool:
         """Whether edges made the speeds; stated: somebody says so, and is believed if need be."""
@@ -316,6 +325,21 @@ def _linked(
     return np.where(agreed, middle - half, low), np.where(agreed, middle + half, high), fits
 
 
+def _colour(width: FloatArray, slack: FloatArray, measured: BoolArray) -> FloatArray:
+    """Correlations, (n,), of when each edge was with when the one of the mean before was.
+
+    width: of their bounds, slack: of the time from the edge before, infinite where it is not known;
+    measured: where there are means. Edges of no mean pass on what they have of the one before.
+    """
+    both = width * np.append(0.0, width[:-1])
+    apart = both / _FIRM + _LOOSER * slack**2
+    part = np.divide(both, apart, out=np.zeros(len(width)), where=both > 0.0)
+    logarithms = np.cumsum(np.log(np.maximum(part, _NO_PART)))
+    colour = np.zeros(len(width))
+    colour[measured] = np.exp(np.diff(logarithms[measured], prepend=np.inf))
+    return colour
+
+
 def _largest(values: FloatArray, chain: IntArray) -> FloatArray:
     """The largest of each value and those before it in its chain, (n,); chain: rising numbers."""
     apart = (1.0 + np.ptp(values)) * chain
@@ -373,9 +397,9 @@ def mean_speeds(
     intervals = _shown_by(tick, counts, omega * (dt / count), by_edges)
     if intervals is None:
         return None
-    rates, begin, end, deviation = _at_rows(intervals, tick)
+    rates, begin, end, deviation, colour = _at_rows(intervals, tick)
     windows = np.stack([begin - tick, end - tick], axis=1) * dt
-    return MeanSpeeds(rates * (count / dt), windows, deviation * dt)
+    return MeanSpeeds(rates * (count / dt), windows, deviation * dt, colour)
 
 
 def _shown_by(
@@ -392,7 +416,7 @@ def _shown_by(
 
 
 def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, ...]:
-    """Mean rate, begin, end and deviation of the interval that each row tells of, (n,) each."""
+    """Mean rate, begin, end, deviation and colour of the interval of each row, (n,) each."""
     n = len(tick)
     before = np.searchsorted(intervals.rows, np.arange(n), side="right") - 1
     after = np.minimum(before + 1, len(intervals.rows) - 1)
@@ -409,4 +433,5 @@ def _at_rows(intervals: _Intervals, tick: IntArray) -> tuple[FloatArray, ...]:
     end[silent] = np.where(last, float(tick[-1]), tick)[silent]
     # Rows that tell of the same interval have the same error, and all together count as one.
     _, place, repeated = np.unique(interval, return_inverse=True, return_counts=True)
-    return rate, begin, end, intervals.deviation[interval] * np.sqrt(repeated[place])
+    deviation = intervals.deviation[interval] * np.sqrt(repeated[place])
+    return rate, begin, end, deviation, intervals.colour[interval]

@@ -98,15 +98,17 @@ def kalman_filter(
     driven: tuple[int, ...] = (),
     averaged: tuple[int, ...] = (),
     coloured: bool = False,
+    jittered: bool = False,
 ) -> Filter:
     """Compile a model's filter for noise on some inputs and states; as ``kernels``.
 
     noisy, driven: their places; averaged: places of outputs, as of ``FilterKernel``, whose model
-    is ``with_integrals`` of them; coloured: whether the inputs' noise may be. Raises ModelError for
+    is ``with_integrals`` of them; coloured: whether the inputs' noise may be; jittered: whether
+    how late means were is not known. Raises ModelError for
     equations that cannot be differentiated.
     """
     varied = variation(model, noisy, driven)
-    kernel = FilterKernel(model, varied, averaged, coloured=coloured)
+    kernel = FilterKernel(model, varied, averaged, coloured=coloured, jittered=jittered)
     text = f"{kernel.structure.program}\n\n{kernel.text()}"
     return Filter(model, kernel, *_compiled(model, text, {}, ("innovations",)))
 

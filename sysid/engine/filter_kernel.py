@@ -16,7 +16,8 @@ the variance r of the output
 and what is kept of e, the innovation, is e sqrt(r0 / s), with r0 a variance like r but the same for
 all samples: without noise of inputs and process, and of one variance, the error of the free run.
 Noise of the inputs may be coloured: n_(k+1) is then a part of n_k, the colour, and what is new in
-it. With noise of the process the sum of log(s / r) stands behind the sum of their squares. With
+it. So is how late means were, t_k, of variance one, of which an output has its shift times t_k
+more. With noise of the process the sum of log(s / r) stands behind the sum of their squares. With
 ``corrects`` zero nothing is taken in: e is that error whatever the noise, and s its variance.
 Chromosomes are lanes, as in the batch kernel; ``halves`` of them, one or two, are worked out.
 """
@@ -43,11 +44,11 @@ class FilterKernel(BatchKernel):
     then has the integrals of these, in their order, as its last states and its last outputs: they
     begin at zero in every sample. A mean is the output at the sample before, that at the sample,
     the integral in between and the sum so far, times the ``mean`` weights; so is, by weights of its
-    own, the sum that is kept for the next sample.
+    own, the sum that is kept for the next sample. jittered: how late these means were is a state.
 
     Behind the rows of lanes of the batch kernel the work area holds P's upper triangle, of the
-    reached states, then of the noisy inputs, then of the averaged outputs at the sample before and
-    then of their sums so far, the estimates of each noise and of those outputs and sums, and
+    reached states, then of the noisy inputs, then of the averaged outputs at the sample before, of
+    their sums so far and of how late they were, the estimates of each noise and of all those, and
     measured outputs, then their innovations. Loops over lanes that work out more than a few numbers
     read and write nothing else: LLVM would have to make sure that no array overlaps another, and
     leaves what needs many such checks as scalar code.
@@ -60,6 +61,7 @@ class FilterKernel(BatchKernel):
         averaged: Sequence[int] = (),
         *,
         coloured: bool = False,
+        jittered: bool = False,
     ) -> None:
         super().__init__(model, variation.structure)
         self.coloured = coloured
@@ -76,12 +78,13 @@ class FilterKernel(BatchKernel):
         self.lag = {j: self.size + m for m, j in enumerate(self.averaged)}
         count = len(self.averaged)
         self.summed = {j: place + count for j, place in self.lag.items()}
-        self.places = range(self.size + 2 * count)
+        self.late = {j: place + count for j, place in self.summed.items() if jittered}
+        self.places = range(self.size + 2 * count + len(self.late))
         self.pairs = [(a, b) for a in self.places for b in self.places if a <= b]
         self.covariance = self.work_rows
         self.noises = self.covariance + len(self.pairs)
         self.before = self.noises + self.n_noises - self.size
-        self.innovation = self.noises + self.n_noises + 2 * count
+        self.innovation = self.before + len(self.places)
         self.work_rows = self.innovation + self.n_measured
 
     def text(self, *, many_registers: bool = False) -> str:
@@ -93,6 +96,7 @@ class FilterKernel(BatchKernel):
             *[f"w{j} = w[k, {j}]" for j in outputs],
             *[f"seen{j} = 1.0 if w{j} > 0.0 else 0.0" for j in outputs],
             *[f"of_output{j} = r[k, {j}]" for j in outputs],
+            *[f"shift{j} = shift[k, {j}]" for j in self.late],
             *self._weights_of_means(),
             *self._traced("before"),
             *[f"copy_row(X, {self.innovation + j}, y, k * {q} + {j})" for j in outputs],
@@ -100,6 +104,7 @@ class FilterKernel(BatchKernel):
             *residuals_kept(q, self.innovation),
             *self._traced("after"),
             *block("if k == n_samples - 1:", ["break"]),
+            *[f"lasting{j} = lasting[k + 1, {j}]" for j in self.late],
             *self._input_slopes(),
             *self._each_lane(self._undisturbed()),
             *block("for step in range(n_steps):", self._stage_inputs(), self._all_lanes(False)),
@@ -121,8 +126,9 @@ class FilterKernel(BatchKernel):
             *block(f"for j in range({2 * q}):", block(EACH_LANE, [sums])),
         ]
         head = (
-            "def innovations(X, rows, tables, u, y, w, r, unit, mean, s, colour, intensity, "
-            "spread, corrects, start, p, dt, n_steps, halves, sums, record, before, after):"
+            "def innovations(X, rows, tables, u, y, w, r, unit, mean, shift, lasting, s, colour, "
+            "intensity, spread, corrects, start, p, dt, n_steps, halves, sums, record, before, "
+            "after):"
         )
         return "\n".join(block(head, body))
 
@@ -146,6 +152,7 @@ class FilterKernel(BatchKernel):
         variances = {
             (a, a): f"spread[{a}]" if a < n else f"of_input{a - n}" for a in range(self.size)
         }
+        variances |= {(place, place): "1.0" for place in self.late.values()}
         behind = self.places[n:]
         nothing = [f"{at(self.before + place)} = 0.0" for place in behind]
         return [*self._stored(variances), *nothing]
@@ -156,6 +163,7 @@ class FilterKernel(BatchKernel):
         if self.output_states is None and self.variation.gains:
             lines += self.call("gains", "g", [at(i) for i in range(self.n_states)], "v")
         expected = {n + k: at(self.noises + k) for k in range(self.n_noises) if self.coloured}
+        expected |= {place: at(self.before + place) for place in self.late.values()}
         lines += [*self._loaded(), *[f"d{a} = {expected.get(a, 0.0)}" for a in self.places]]
         for j in range(self.n_measured):
             lines += self._taken_in(j)
@@ -165,6 +173,7 @@ class FilterKernel(BatchKernel):
             for a in self.places:
                 lines.append(f"L{place}_{a} = {_sum(_products(row, _covariance_with(a)))}")
         lines += [f"{at(self.before + place)} = next{place}" for place in kept]
+        lines += [f"{at(self.before + place)} = d{place}" for place in self.late.values()]
         lines += [
             f"{at(i)} = 0.0" if a in begun else f"{at(i)} += d{a}"
             for a, i in enumerate(self.reached)
@@ -173,6 +182,7 @@ class FilterKernel(BatchKernel):
         variances = {(a, b): f"P{a}_{b}" for a, b in self.pairs}
         for place in kept:
             variances |= {(a, place): f"L{place}_{a}" for a in range(self.size)}
+            variances |= {(place, late): f"L{place}_{late}" for late in self.late.values()}
             for behind, (_, row) in kept.items():
                 if behind >= place:
                     variances[place, behind] = _sum(_products(row, f"L{place}_{{}}".format))
@@ -218,6 +228,7 @@ class FilterKernel(BatchKernel):
         predicted = [f"o{j}"]
         if j in self.lag:
             predicted, gains = self._summed_up(j, _OF_MEAN)
+            gains |= {self.late[j]: f"shift{j}"} if j in self.late else {}
         expected = _sum([*predicted, *_products(gains, "d{}".format)])
         lines.append(f"e = {expected} - {self._innovation(j)}")
         kept = f"e = e * (w{j} * math.sqrt(unit{j} / of_output{j}))"
@@ -306,7 +317,7 @@ class FilterKernel(BatchKernel):
         if self.coloured:
             variances |= self._going_on(fresh)
             lines += [f"{at(self.noises + k)} *= colour{k}" for k in fresh]
-        return lines + self._stored(variances)
+        return lines + self._stored(variances | self._lasting(variances)) + self._moved_on()
 
     def _going_on(self, fresh: Mapping[int, str]) -> dict[_Place, str]:
         """Covariances of noises of the next sample with one another and with what is kept."""
@@ -317,6 +328,21 @@ class FilterKernel(BatchKernel):
                 parts += [f"colour{b - n}"] if b < self.size else []
                 going[a, b] = _sum([" * ".join(parts), *([fresh[a - n]] if a == b else [])])
         return going
+
+    def _lasting(self, variances: Mapping[_Place, str]) -> dict[_Place, str]:
+        """Covariances with how late means were, as that goes on to the next sample."""
+        going = {}
+        places = {place: j for j, place in self.late.items()}
+        for (a, b), text in variances.items():
+            parts = [f"lasting{places[place]}" for place in (a, b) if place in places]
+            if parts:
+                going[a, b] = " * ".join([*parts, f"({text})"])
+                going[a, b] += f" + 1.0 - {' * '.join(parts)}" if a == b else ""
+        return going
+
+    def _moved_on(self) -> list[str]:
+        """How late means were, as that goes on to the next sample."""
+        return [f"{at(self.before + place)} *= lasting{j}" for j, place in self.late.items()]
 
     def _process(self) -> list[dict[int, str]]:
         """Responses to a level rate of each driven state, by row."""

@@ -179,6 +179,8 @@ def filter_response(
     mean: FloatArray,
     weights: FloatArray,
     variances: FloatArray,
+    shift: FloatArray,
+    lasting: FloatArray,
     noise: FloatArray,
     colour: FloatArray,
     corrects: bool,
@@ -188,8 +190,8 @@ def filter_response(
     averaged: places of the outputs whose integrals are the model's last states. slopes: of the
     intervals, from states as corrected. before: (n_samples, work_rows), the kernel's work area
     before each sample's outputs. mean: (n_samples, n_outputs, 2, 4), weights of means and of sums,
-    weights: (n_samples, n_outputs), variances: of that shape, as the kernel had them; noise:
-    (n_outputs,), variances. colour: (n_noises,).
+    weights: (n_samples, n_outputs), variances, shift, lasting: of that shape, as the kernel had
+    them; noise: (n_outputs,), variances. colour: (n_noises,).
     """
     intervals, n_states = slopes.intervals, slopes.states.shape[1]
     model, inputs, vector = intervals.model, intervals.inputs, intervals.vector
@@ -204,6 +206,8 @@ def filter_response(
     seen = (weights > 0.0) * float(corrects)
     for j in range(q):
         rows[:, j] = deviations.row(j, of_outputs, mean[:, j, 0])
+        if j in deviations.late:
+            rows[:, j, deviations.late[j]] = shift[:, j]
         shared = np.einsum("kab,kb->ka", covariance, rows[:, j])
         variance = np.einsum("ka,ka->k", rows[:, j], shared) + variances[:, j]
         gains[:, j] = shared * (seen[:, j] / variance)[:, None]
@@ -219,6 +223,8 @@ def filter_response(
         begin, end = slopes.by_input(noisy[k])
         onward[:-1, place, :n_states] = begin + colour[k] * end
         onward[:, place, place] = colour[k]
+    for j, place in deviations.late.items():
+        onward[:-1, place, place] = lasting[1:, j]
     foreseen = states[:, : n_states - len(averaged)]
     return LinearResponse(rows, gains, taken.swapaxes(1, 2) @ onward, kept, foreseen, slopes)
 
@@ -235,7 +241,7 @@ def _onward(slopes: IntervalSlopes, m: int) -> FloatArray:
 
 
 class _Deviations:
-    """Places of a filter's deviations: states, noises, averaged outputs before, their sums."""
+    """Places of a filter's deviations: states, noises, averaged outputs before, sums, timing."""
 
     def __init__(self, kernel: FilterKernel, n_states: int, averaged: Sequence[int]) -> None:
         self._kernel = kernel
@@ -244,9 +250,10 @@ class _Deviations:
         self.integral = {j: n_states - count + i for i, j in enumerate(averaged)}
         self.lag = {j: first + i for i, j in enumerate(averaged)}
         self.summed = {j: first + count + i for i, j in enumerate(averaged)}
-        self.size = first + 2 * count
+        self.late = {j: first + 2 * count + i for i, j in enumerate(kernel.late)}
+        self.size = first + 2 * count + len(self.late)
         behind = [self.lag[j] for j in kernel.lag] + [self.summed[j] for j in kernel.summed]
-        self._of_kernel = [*kernel.reached, *self.noises, *behind]
+        self._of_kernel = [*kernel.reached, *self.noises, *behind, *self.late.values()]
 
     def covariance(self, before: FloatArray) -> FloatArray:
         """Covariance before each sample's outputs, (n_samples, m, m)."""

@@ -232,8 +232,9 @@ class RecordSimulator:
         padded = lanes.take(_ALL_LANES, mode="wrap")
         first = [*self._starting, *[None] * kernel.n_states]
         (mean, cut), weights = self._taken_in(kernel, settings)
-        unit, variances = self._variances(settings)
-        spread = [0.0 if (j := first[i]) is None else variances[0, j] for i in kernel.reached]
+        unit, variances, shift = self._variances(kernel, settings)
+        of_first = variances[0] + shift[0] ** 2
+        spread = [0.0 if (j := first[i]) is None else of_first[j] for i in kernel.reached]
         driven, noisy = list(kernel.variation.driven), list(kernel.variation.noisy)
         process = np.broadcast_to(settings.process, len(model.states))
         intensity = process[driven] ** 2 / record.dt
@@ -255,8 +256,8 @@ class RecordSimulator:
         with explained_errors(model):
             kalman.innovations(
                 work, work.reshape(-1, LANES), kernel.tables, inputs, measured, weights,
-                variances, unit, mean, of_inputs, colour, intensity, np.array(spread),
-                float(settings.corrects), start,
+                variances, unit, mean, shift, self._lasting(settings), of_inputs, colour,
+                intensity, np.array(spread), float(settings.corrects), start,
                 np.ascontiguousarray(parameters[padded].T), record.dt, n_steps,
                 -(-len(lanes) // (LANES // 2)), sums, kept, *traces,
             )  # fmt: skip
@@ -277,10 +278,22 @@ class RecordSimulator:
         weights[0, starting + over] = 0.0  # of the latter no mean is over yet
         return means, weights
 
-    def _variances(self, settings: FilterSettings) -> tuple[FloatArray, FloatArray]:
-        """Variances of the outputs, (n_outputs,), and of each sample, (n_samples, n_outputs)."""
-        unit = settings.noise**2
-        return unit, np.full(self._measured.shape, unit + settings.scatter)
+    def _variances(
+        self, kernel: FilterKernel, settings: FilterSettings
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Variances of the outputs, (n_outputs,), and of each sample, (n_samples, n_outputs).
+
+        The latter beside what means that are late are more, which is the third.
+        """
+        unit, shape = settings.noise**2, self._measured.shape
+        shift = np.zeros(shape)
+        timed = list(kernel.late)
+        shift[:, timed] = np.broadcast_to(settings.shift, shape)[:, timed]
+        return unit, np.full(shape, unit + settings.scatter) - shift**2, shift
+
+    def _lasting(self, settings: FilterSettings) -> FloatArray:
+        """How much of how late means were goes on from the sample before, as of ``_variances``."""
+        return np.ascontiguousarray(np.broadcast_to(settings.jitter_colour, self._measured.shape))
 
     def _colour(self, kernel: FilterKernel, settings: FilterSettings) -> FloatArray:
         """Colour of the noisy inputs' noise."""
@@ -299,7 +312,7 @@ class RecordSimulator:
         kernel, record = kalman.kernel, self.record
         n, n_states = record.n_samples, kernel.variation.n_states
         before, after = np.zeros((n, kernel.work_rows)), np.zeros((n, n_states))
-        unit, variances = self._variances(settings)
+        unit, variances, shift = self._variances(kernel, settings)
         self.innovations(
             kalman, settings, vector[None], start[None], np.zeros(1, dtype=np.int64), n_steps,
             np.empty((*variances.shape, 1)), (before, after),
@@ -308,7 +321,7 @@ class RecordSimulator:
         mean, _ = self._means(self.averaged, settings.corrects)
         return filter_response(
             kernel, self.averaged, IntervalSlopes(intervals, after), before, mean,
-            self._taken_in(kernel, settings)[1], variances, unit,
+            self._taken_in(kernel, settings)[1], variances, shift, self._lasting(settings), unit,
             self._colour(kernel, settings), settings.corrects,
         )  # fmt: skip
 

@@ -275,7 +275,8 @@ class BatchSimulator:
         process = np.broadcast_to(settings[0].process, len(self.model.states))
         driven = tuple(np.flatnonzero(process).tolist())
         coloured = any(np.any(each.colour) for each in settings)
-        return kalman_filter(model, noisy_inputs(records), driven, averaged, coloured)
+        jittered = any(np.any(each.shift) for each in settings)
+        return kalman_filter(model, noisy_inputs(records), driven, averaged, coloured, jittered)
 
     def beyond_parabolas(
         self,

@@ -39,7 +39,7 @@ from sysid.engine.filter_settings import FilterSettings
 from sysid.engine.linear_response import LinearResponse
 from sysid.engine.simulation import BatchResult, Residuals, Status
 from sysid.fitting.averages import coloured, denoised
-from sysid.fitting.means import each_mean_once, scatter
+from sysid.fitting.means import Scatter, each_mean_once, scatter
 from sysid.fitting.moves import moved_by
 from sysid.fitting.objective import Objective
 from sysid.fitting.reactions import with_reactions
@@ -85,15 +85,16 @@ class Innovations(Objective):
     the same of the free run's errors at the chromosome that it began with. corrects: whether
     outputs correct the states. process: (n_states,), noise of the states' rates, in their units
     over the root of a second. scatter: per record, (n_samples, n_outputs), variances of single
-    samples beside the noise, by the jitter of their windows. Where it corrects, the records have
-    each mean over a window once. coarseness: integration steps of a free run that one of the
-    filter's stands for; least: of the filter's in a sample. exact: whether averages are not of
-    parabolas between samples. trust: per record, (n_samples, n_outputs), parts of each innovation
-    that count.
+    samples beside the noise, by the jitter of their windows; shift: likewise, as of ``Scatter``.
+    Where it corrects, the records have each mean over a window once. coarseness: integration steps
+    of a free run that one of the filter's stands for; least: of the filter's in a sample. exact:
+    whether averages are not of parabolas between samples. trust: per record, (n_samples,
+    n_outputs), parts of each innovation that count.
     """
 
     noise: FloatArray
     scatter: list[FloatArray]
+    shift: list[FloatArray]
     error: FloatArray
     corrects: bool
     process: FloatArray
@@ -130,7 +131,7 @@ class Innovations(Objective):
             parts = [denoised(record) for record in variant.records]
             variant.records, variant.colour = [q.record for q in parts], [q.colour for q in parts]
         variant.noise = variant.error = np.maximum(noise, _TINY)
-        variant.scatter = variant._scatters(near)
+        variant.scatter, variant.shift = _parts_of(variant._scatters(near))
         variant.trust = _full(variant.records)
         variant.corrects, variant.exact = corrects, False
         variant.coarseness, variant.least = 1.0, 1
@@ -283,14 +284,14 @@ class Innovations(Objective):
             for record, start in zip(self.records, starts, strict=True)
         ]
 
-    def _scatters(self, chromosome: FloatArray | None) -> list[FloatArray]:
-        """Per record, (n_samples, n_outputs), by free runs at a chromosome, (n_free,), if any."""
+    def _scatters(self, chromosome: FloatArray | None) -> list[Scatter]:
+        """Per record, by free runs at a chromosome, (n_free,), if any."""
         if chromosome is None:
             return [scatter(record) for record in self.records]
         vector = self.space.full(chromosome[None])[0]
         starts = self._starts(chromosome[None])
 
-        def by_run(record: Dataset, start: FloatArray) -> FloatArray:
+        def by_run(record: Dataset, start: FloatArray) -> Scatter:
             return scatter(
                 record, lambda r: self.simulator.trajectories(vector, r, starts=start)[0]
             )
@@ -354,12 +355,13 @@ class Innovations(Objective):
         part = super().on(records, places)
         if places is not None:
             colours = [self.colour[place] for place in places]
-            scatters = [scatter(record) for record in records]
-            vars(part).update(colour=colours, scatter=scatters, trust=_full(records))
+            variances, shifts = _parts_of([scatter(record) for record in records])
+            vars(part).update(colour=colours, scatter=variances, shift=shifts, trust=_full(records))
         else:
             lengths = [record.n_samples for record in records]
             trust = _cut(self.trust, lengths)
-            vars(part).update(scatter=_cut(self.scatter, lengths), trust=trust)
+            scatters, shifts = (_cut(tables, lengths) for tables in (self.scatter, self.shift))
+            vars(part).update(scatter=scatters, shift=shifts, trust=trust)
             if not self.quiet:
                 part.counts = _counted(records, np.concatenate(trust))
         return part
@@ -367,7 +369,9 @@ class Innovations(Objective):
     def of_record(self, place: int, record: Dataset) -> Objective:
         """As of ``Objective``, with scatter and trust of the record in whose place it is."""
         part = super().of_record(place, record)
-        vars(part).update(scatter=[self.scatter[place]], trust=[self.trust[place]])
+        vars(part).update(
+            scatter=[self.scatter[place]], shift=[self.shift[place]], trust=[self.trust[place]]
+        )
         return part
 
     @property
@@ -598,15 +602,28 @@ class Innovations(Objective):
         """Per record, those of a filter."""
         return [
             FilterSettings(
-                self.noise, scatter, trust, self.process, colour, self.corrects, self.exact
+                self.noise,
+                self.scatter[place],
+                self.shift[place] * float(self.corrects),
+                record.jitter_colour if record.jitter_colour.size else 0.0,
+                self.trust[place],
+                self.process,
+                self.colour[place],
+                self.corrects,
+                self.exact,
             )
-            for scatter, trust, colour in zip(self.scatter, self.trust, self.colour, strict=True)
+            for place, record in enumerate(self.records)
         ]
 
 
 def filters(objective: Objective) -> TypeGuard[Innovations]:
     """Whether an objective is of a filter's innovations, which corrects itself."""
     return isinstance(objective, Innovations) and objective.corrects
+
+
+def _parts_of(scatters: Sequence[Scatter]) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Their variances and shifts."""
+    return [each.variance for each in scatters], [each.shift for each in scatters]
 
 
 def _cut(tables: Sequence[FloatArray], lengths: Sequence[int]) -> list[FloatArray]:

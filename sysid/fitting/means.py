@@ -1,11 +1,11 @@
 """Means over windows as a filter takes them in: each once, in the sample in which it ends."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.arrays import FloatArray, IntArray
+from sysid.arrays import BoolArray, FloatArray, IntArray
 from sysid.problem.data import Dataset
 
 _SAME = 1e-6  # samples by which windows of one mean differ for the arithmetic's sake
@@ -16,6 +16,7 @@ _OVERLAP, _FEW = 1.0, 0.05
 # Of the mean square of the slopes around, which that beside a mean is taken for at least: where it
 # seems to rest, between two turns, it does not. Means on each side that are around it.
 _AROUND, _NEAR = 0.05, 3
+_NO_PART = 1e-3  # of a colour, that is none
 _WIDE = 10  # the same of those by which a run is judged
 
 Run = Callable[[Dataset], FloatArray]  # outputs (n_samples, n_outputs) of a record's inputs
@@ -27,6 +28,7 @@ def each_mean_once(record: Dataset) -> Dataset:
     Rows that tell of the same window, perhaps before it has ended, repeat its mean. Their jitter
     is such that all of them count as one; that of the one is less by the root of their number.
     An output whose windows overlap stays as it is, and so does the first row, where states start.
+    Errors of when a mean was go on through rows without one.
 
     >>> ends = np.array([0, 3, 3, 3, 4])
     >>> windows = np.stack([[0, 0, 0, 0, 3], ends], axis=1) - np.arange(5)[:, None]
@@ -38,7 +40,7 @@ def each_mean_once(record: Dataset) -> Dataset:
     if not record.windows.size:
         return record
     outputs, windows = record.outputs.copy(), record.windows.astype(np.float64)
-    jitter = record.jitter.astype(np.float64)
+    jitter, colour = record.jitter.astype(np.float64), record.jitter_colour.astype(np.float64)
     for j in np.flatnonzero(record.windows.any(axis=(0, 2))).tolist():
         rows, firsts, spans = _distinct(record, j)
         if not len(rows):
@@ -48,15 +50,25 @@ def each_mean_once(record: Dataset) -> Dataset:
         within = (spans[firsts, 0] > -_SAME) & (ends > 0) & (ends < record.n_samples)
         # Of two that end in a sample the later one.
         within &= np.append(np.diff(ends) > 0, True)
+        all_of = firsts
         firsts, counts, ends = firsts[within], counts[within], ends[within]
         begins = _apart(spans[firsts, 0], ends)
         if begins is None:
             continue
         moved = np.stack([begins, spans[firsts, 1]], axis=1) - ends[:, None]
         values, jitters = outputs[rows[firsts], j], jitter[rows[firsts], j] / np.sqrt(counts)
-        outputs[1:, j], windows[1:, j], jitter[1:, j] = np.nan, 0.0, 0.0
+        parts = _going_on(colour[rows[all_of], j], within)
+        outputs[1:, j], windows[1:, j], jitter[1:, j], colour[1:, j] = np.nan, 0.0, 0.0, 1.0
         outputs[ends, j], windows[ends, j], jitter[ends, j] = values, moved * record.dt, jitters
-    return replace(record, outputs=outputs, windows=windows, jitter=jitter)
+        colour[ends, j] = parts
+    return replace(record, outputs=outputs, windows=windows, jitter=jitter, jitter_colour=colour)
+
+
+def _going_on(colours: FloatArray, kept: BoolArray) -> FloatArray:
+    """Of colours from each window to the next, (n,), those from each that is kept to the next."""
+    passed = np.cumsum(np.log(np.maximum(colours, _NO_PART)))[kept]
+    going_on: FloatArray = np.exp(np.minimum(np.diff(passed, prepend=np.inf), 0.0))
+    return going_on
 
 
 def _apart(begins: FloatArray, ends: IntArray) -> FloatArray | None:
@@ -75,8 +87,21 @@ def _apart(begins: FloatArray, ends: IntArray) -> FloatArray | None:
     return begins
 
 
-def scatter(record: Dataset, run: Run | None = None) -> FloatArray:
-    """Variances (n_samples, n_outputs) that the jitter of the windows makes of their means.
+@dataclass(frozen=True)
+class Scatter:
+    """What the jitter of windows does to their means, (n_samples, n_outputs) each.
+
+    variance: of it. shift: what a mean that is a deviation of its jitter later is more, as far as
+    it changes alike on both sides; its square is a part of the variance. Zero where rows repeat a
+    mean.
+    """
+
+    variance: FloatArray
+    shift: FloatArray
+
+
+def scatter(record: Dataset, run: Run | None = None) -> Scatter:
+    """What the jitter of the windows makes of their means.
 
     By how fast an output changes to the means before and behind each, as measured, without what
     the jitter itself does to that. Not by the slope from one neighbour to the other, which is none
@@ -85,14 +110,15 @@ def scatter(record: Dataset, run: Run | None = None) -> FloatArray:
 
     >>> windows = np.tile([-1.0, 0.0], (4, 1, 1))
     >>> ramp = Dataset(np.ones(4), [1, 3, 5, 7], 1.0, windows=windows, jitter=np.full((4, 1), 0.1))
-    >>> np.sqrt(scatter(ramp))[:, 0].round(3)
+    >>> np.sqrt(scatter(ramp).variance)[:, 0].round(3)
     array([0.198, 0.198, 0.198, 0.198])
-    >>> np.sqrt(scatter(replace(ramp, outputs=np.array([[1], [3], [1], [-1]]))))[:, 0].round(3)
-    array([0.198, 0.198, 0.198, 0.198])
+    >>> turned = scatter(replace(ramp, outputs=np.array([[1], [3], [1], [-1]])))
+    >>> np.sqrt(turned.variance)[:, 0].round(3), turned.shift[:, 0].round(3)
+    (array([0.198, 0.198, 0.198, 0.198]), array([ 0.198,  0.   , -0.198, -0.198]))
     """
-    variances = np.zeros(record.outputs.shape)
+    variances, shifts = np.zeros(record.outputs.shape), np.zeros(record.outputs.shape)
     if not (record.windows.size and record.jitter.any()):
-        return variances
+        return Scatter(variances, shifts)
     of_run = None if run is None else _of_run(record, run)
     for j in np.flatnonzero(record.windows.any(axis=(0, 2))).tolist():
         rows, firsts, spans = _distinct(record, j)
@@ -104,16 +130,22 @@ def scatter(record: Dataset, run: Run | None = None) -> FloatArray:
         excess = 1.0 + (in_time[1:] + in_time[:-1]) / apart**2
         distinct, measured = rows[firsts], record.outputs[rows[firsts], j]
         plain = np.diff(measured) / apart
-        squares = _squares(np.zeros(len(distinct)), plain, excess)
+        level = np.zeros(len(distinct))
+        squares, rates = _squares(level, plain, excess), _mean_of_sides(level, plain)
         if of_run is not None:
             means, slopes = (table[distinct, j] for table in of_run)
             beside = np.diff(measured - means) / apart
             straighter = _bend(beside) < _bend(plain)
             squares = np.where(straighter, _squares(slopes, beside, excess), squares)
+            rates = np.where(straighter, _mean_of_sides(slopes, beside), rates)
         squares = np.maximum(squares, _AROUND * _around(squares, _NEAR))
         place = np.searchsorted(firsts, np.arange(len(rows)), side="right") - 1
         variances[rows, j] = squares[place] * jitter**2
-    return variances
+        most = np.sqrt(squares[counts == 1])
+        alone = distinct[counts == 1]
+        rates = np.clip(rates[counts == 1], -most, most)
+        shifts[alone, j] = rates * record.jitter[alone, j]
+    return Scatter(variances, shifts)
 
 
 def _of_run(record: Dataset, run: Run) -> tuple[FloatArray, FloatArray]:
@@ -136,6 +168,13 @@ def _squares(slopes: FloatArray, chords: FloatArray, excess: FloatArray) -> Floa
     before, behind = (slopes[1:] + chords) ** 2 / excess, (slopes[:-1] + chords) ** 2 / excess
     squares: FloatArray = 0.5 * (np.append(behind[0], before) + np.append(behind, before[-1]))
     return squares
+
+
+def _mean_of_sides(slopes: FloatArray, chords: FloatArray) -> FloatArray:
+    """Means, (n,), of what ``_squares`` squares."""
+    before, behind = slopes[1:] + chords, slopes[:-1] + chords
+    means: FloatArray = 0.5 * (np.append(behind[0], before) + np.append(behind, before[-1]))
+    return means
 
 
 def _bend(chords: FloatArray) -> FloatArray:

@@ -331,7 +331,7 @@ def _weights(runs: Sequence[DisturbedRun], local: Sensitivity) -> FloatArray:
     """
 
     def scattered(run: DisturbedRun) -> FloatArray:
-        return scatter(run.record, lambda record: run.over(record.windows))
+        return scatter(run.record, lambda record: run.over(record.windows)).variance
 
     pairs = zip(runs, local.objective.scales, strict=True)
     scattering = np.concatenate([scattered(run) / scale**2 for run, scale in pairs])

@@ -140,6 +140,9 @@ def _with_exchanged(record: Dataset, side: Side, i: int, j: int) -> Dataset:
         output_zero=_exchanged(record.output_zero, i, j),
         windows=_exchanged(record.windows, i, j, axis=1) if record.windows.size else record.windows,
         jitter=_exchanged(record.jitter, i, j) if record.jitter.size else record.jitter,
+        jitter_colour=np.zeros(0)
+        if not record.jitter.size
+        else _exchanged(record.jitter_colour, i, j),
     )
 
 

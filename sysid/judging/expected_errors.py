@@ -175,7 +175,9 @@ def _by_jitter(record: Dataset, run: Run) -> FloatArray:
     once = each_mean_once(record)
     single = once.jitter > 0.0
     counts = np.maximum(single.sum(axis=0), 1)
-    variance: FloatArray = np.sum(np.where(single, scatter(once, run), 0.0), axis=0) / counts
+    variance: FloatArray = (
+        np.sum(np.where(single, scatter(once, run).variance, 0.0), axis=0) / counts
+    )
     return variance
 
 

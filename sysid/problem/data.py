@@ -25,7 +25,8 @@ class Dataset:
     errors can be; 0 where it is not known. windows: (n_samples, n_outputs, 2), the time over which
     a sensor averaged each sample of an output, its begin and end in seconds from the sample on;
     both 0 where it was sampled at its instant. Simulated outputs are averaged alike. jitter:
-    (n_samples, n_outputs), standard deviation of when each window was [s]. between: (n_samples,
+    (n_samples, n_outputs), standard deviation of when each window was [s]; jitter_colour: of that
+    shape, correlation of its error with that of the window before. between: (n_samples,
     n_inputs), by how much the mean of an interpolated input up to the next sample differs from that
     of a straight line, for which filters bend it. changes: (n_samples, n_inputs), by how much a
     held input changes before the next sample; last_part: (n_inputs,), part of the time up to that
@@ -54,6 +55,7 @@ class Dataset:
     output_noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     windows: FloatArray = field(default_factory=lambda: np.zeros(0))
     jitter: FloatArray = field(default_factory=lambda: np.zeros(0))
+    jitter_colour: FloatArray = field(default_factory=lambda: np.zeros(0))
     between: FloatArray = field(default_factory=lambda: np.zeros(0))
     changes: FloatArray = field(default_factory=lambda: np.zeros(0))
     last_part: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -119,6 +121,14 @@ class Dataset:
                 f"{self.name}: jitter must hold a finite number, 0 or more, for each sample and "
                 f"output: {self.outputs.shape}; it has shape {self.jitter.shape}"
             )
+        if self.jitter_colour.size == 0:
+            object.__setattr__(self, "jitter_colour", np.zeros(self.outputs.shape))
+        colour = self.jitter_colour
+        if colour.shape != self.outputs.shape or not np.all((colour >= 0.0) & (colour <= 1.0)):
+            raise ModelError(
+                f"{self.name}: jitter_colour must hold a number from 0 to 1 for each sample and "
+                f"output: {self.outputs.shape}; it has shape {colour.shape}"
+            )
 
     def _table(self, name: str) -> FloatArray:
         """Inputs or outputs as real numbers, (n_samples, n); ModelError where they are others."""
@@ -172,6 +182,7 @@ class Dataset:
             outputs=self.outputs[rows],
             windows=self.windows[rows],
             jitter=self.jitter[rows],
+            jitter_colour=self.jitter_colour[rows],
             between=self.between[rows],
             changes=self.changes[rows],
             name=name,

@@ -102,11 +102,12 @@ def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) ->
     moved = np.column_stack(
         [at_places(values, rows + shifts[k], held[k]) for k, values in enumerate(channels)]
     )
-    windows, jitter = record.windows, record.jitter
+    windows, jitter, colour = record.windows, record.jitter, record.jitter_colour
     if windows.size:
         places = np.round(rows[:, None] + shifts[n:]).astype(np.int64)
         windows = np.take_along_axis(windows, places[..., None], axis=0)
         jitter = np.take_along_axis(jitter, places, axis=0)
+        colour = np.take_along_axis(colour, places, axis=0)
     changes, last_part = _changes(record.inputs, rows, np.where(held[:n], shifts[:n], 0.0))
     made = replace(
         record,
@@ -114,6 +115,7 @@ def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) ->
         outputs=moved[:, n:],
         windows=windows,
         jitter=jitter,
+        jitter_colour=colour,
         changes=changes,
         last_part=last_part,
     )
@@ -276,6 +278,7 @@ def _decimated(model: ProcessModel, before: Prepared, preparation: Preparation) 
         dt=factor * record.dt,
         windows=record.windows[kept],
         jitter=record.jitter[kept] * rest,
+        jitter_colour=np.zeros(0),
         input_noise=record.input_noise * np.where(held, rest_of_held, rest),
         output_noise=record.output_noise * rest,
         changes=np.zeros(0),

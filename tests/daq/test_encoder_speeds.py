@@ -195,7 +195,7 @@ def test_errors_are_as_large_as_their_variances_say_where_the_speed_has_its_corn
         windows=speeds.windows[:, None], jitter=speeds.jitter[:, None],
     )  # fmt: skip
     error = speeds.values - mean_over(angle, speeds.windows)
-    variance = scatter(record)[:, 0]
+    variance = scatter(record).variance[:, 0]
     parts = error / np.sqrt(variance + 0.001**2)
     # Most samples of the swing are known to less than what is added.
     assert 0.5 < np.sqrt(np.nanmean(parts[variance > 0.001**2] ** 2)) < 1.1
@@ -225,6 +225,29 @@ def test_edges_are_timed_by_those_before_and_behind_them():
     assert np.sqrt(np.mean(late**2)) < 0.5 * alone
     assert np.sqrt(np.mean((speeds.jitter[begun] / DT) ** 2)) < 0.5 * alone
     assert abs(np.mean(late)) < 0.03
+
+
+def test_errors_of_when_means_were_go_on_as_their_colour_says():
+    """From one edge to the next as far as the time between both is known."""
+    tick, theta, omega = logged(surging, 4.0)
+    speeds = mean_speeds(tick, theta, omega, DT, COUNT)
+    ends = tick * DT + speeds.windows[:, 1]
+    fresh = np.append(True, np.diff(ends) > 1e-9) & np.isfinite(speeds.values)
+    rows = np.flatnonzero(fresh & (speeds.windows[:, 1] > speeds.windows[:, 0]))
+    begin, end = (tick[rows] * DT + speeds.windows[rows].T).astype(float)
+    slope = [(surging(t + 1e-6) - surging(t - 1e-6)) / 2e-6 for t in (begin, end)]
+    shift = (slope[1] - slope[0]) / (end - begin) * speeds.jitter[rows]
+    error = (speeds.values - mean_over(surging, speeds.windows))[rows]
+    clear = np.abs(shift) > 1e-3
+    late = np.divide(error, shift, out=np.zeros(len(rows)), where=clear)
+    clear &= np.abs(late) < 6.0
+    pairs, colour = clear[1:] & clear[:-1], speeds.colour[rows][1:]
+    for least, most in ((0.0, 0.1), (0.1, 0.3), (0.3, 0.6), (0.6, 0.85), (0.85, 1.0)):
+        alike = pairs & (colour > least) & (colour <= most)
+        assert alike.sum() > 50
+        before, behind = late[:-1][alike], late[1:][alike]
+        shared = np.mean(before * behind) / np.sqrt(np.mean(before**2) * np.mean(behind**2))
+        assert shared == pytest.approx(colour[alike].mean(), abs=0.2)
 
 
 def on_uneven_wheel(angle, off):

@@ -24,12 +24,13 @@ def means_over_the_last_sample():
     return np.sort(np.random.default_rng(1).uniform(-DT, 0.0, (SAMPLES, 1, 2)), axis=2)
 
 
-def filtered(record, vector=(GAIN, TAU), corrects=True, colour=0.5, hold="zoh"):
+def filtered(record, vector=(GAIN, TAU), corrects=True, colour=0.5, hold="zoh", shift=0.0):
     """Innovations (n_samples, 1), and the response, of a model that starts as declared."""
     model = lag().with_holds({"u": hold}).with_initial({"y": 0.0})
     simulator = BatchSimulator(model, threads=1)
     vector, scale, start = np.array(vector), np.ones(1), np.zeros(1)
-    settings = FilterSettings(NOISE, colour=np.array([colour]), corrects=corrects)
+    jitter = {"scatter": 1.5 * shift**2, "shift": shift, "jitter_colour": 0.9}
+    settings = FilterSettings(NOISE, colour=np.array([colour]), corrects=corrects, **jitter)
     innovations = simulator.innovations(
         vector[None], [record], [scale], np.array([[2]]), [start[None]], [settings]
     ).values[..., 0]  # fmt: skip
@@ -41,7 +42,8 @@ def filtered(record, vector=(GAIN, TAU), corrects=True, colour=0.5, hold="zoh"):
 @pytest.mark.parametrize("windows", [INSTANTS, means_over_the_last_sample()])
 def test_outputs_and_rates_are_answered_as_by_filters_that_have_them(windows, hold, colour):
     """The lag is linear: its innovations change in proportion, however much is added."""
-    record, settings = noisy_record(windows), {"hold": hold, "colour": colour}
+    shift = 0.0 if windows is INSTANTS else 0.2 * np.sin(np.arange(float(SAMPLES)))[:, None]
+    record, settings = noisy_record(windows), {"hold": hold, "colour": colour, "shift": shift}
     before, response = filtered(record, **settings)
     added = np.sin(0.3 * np.arange(SAMPLES))[:, None]
     # What is foreseen too high by that was measured too low.

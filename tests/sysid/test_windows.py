@@ -155,6 +155,76 @@ def test_of_means_over_the_last_sample_innovations_are_those_of_a_kalman_filter(
     np.testing.assert_allclose(filtered.values[:, 0, 0], expected, atol=1e-7)
 
 
+def test_when_means_were_is_a_state_of_a_kalman_filter_that_goes_on_by_its_colour():
+    """Its error moves each mean by the shift, and is a part of that of the mean before."""
+    rng = np.random.default_rng(3)
+    u, y = rng.choice([-1.0, 1.0], 80), rng.standard_normal(80)
+    y[[30, 31]] = np.nan
+    windows = np.sort(rng.uniform(-DT, 0.0, (80, 1, 2)), axis=2)
+    shift, rest = rng.uniform(-0.5, 0.5, (80, 1)), rng.uniform(0.0, 0.1, (80, 1))
+    colour = np.where(np.isfinite(y), rng.uniform(0.0, 1.0, 80), 1.0)[:, None]
+    record = Dataset(u, y, DT, input_noise=np.array([0.3]), windows=windows)
+    filtered = BatchSimulator(lag().with_initial({"y": 0.0})).innovations(
+        np.array([[2.0, TAU]]), [record], [np.ones(1)], np.array([[1]]), [None],
+        [FilterSettings(np.array([0.2]), rest + shift**2, shift, colour)],
+    )  # fmt: skip
+    # States are the output and the input's error at the sample before, and when the mean was.
+    x, P, fading = np.zeros(3), np.diag([0.0, 0.3**2, 1.0]), np.exp(-DT / TAU)
+    expected = np.zeros(80)
+    for k in range(1, 80):
+        begin, end = windows[k, 0] + DT
+        mean = TAU * (np.exp(-begin / TAU) - np.exp(-end / TAU)) / (end - begin)
+        lasting = colour[k, 0]
+        x[2] *= lasting
+        P = np.diag([1.0, 1.0, lasting]) @ P @ np.diag([1.0, 1.0, lasting])
+        P[2, 2] += 1.0 - lasting**2
+        H = np.array([mean, 2.0 * (1.0 - mean), shift[k, 0]])
+        driven = np.array([0.0, u[k - 1], 0.0])
+        if np.isfinite(y[k]):
+            s = H @ P @ H + 0.2**2 + rest[k, 0]
+            e = H @ (x + driven) - y[k]
+            expected[k] = e * 0.2 / np.sqrt(s)
+            x, P = x - P @ H / s * e, P - np.outer(P @ H, P @ H) / s
+        F = np.array([[fading, 2.0 * (1.0 - fading), 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        x, P = F @ (x + driven), F @ P @ F.T + np.diag([0.0, 0.3**2, 0.0])
+    np.testing.assert_allclose(filtered.values[:, 0, 0], expected, atol=1e-7)
+
+
+def test_without_corrections_when_means_were_is_a_part_of_their_variance():
+    """However it goes on: nothing is taken in that could tell."""
+    rng, windows = np.random.default_rng(4), np.tile([-DT, 0.0], (80, 1, 1))
+    record = Dataset(
+        rng.standard_normal(80),
+        rng.standard_normal(80),
+        DT,
+        input_noise=np.ones(1),
+        windows=windows,
+    )
+    scatter, shift = np.full((80, 1), 0.3), np.full((80, 1), 0.5)
+    with_shift, without = (
+        BatchSimulator(lag()).innovations(
+            np.array([[2.0, TAU]]), [record], [np.ones(1)], np.array([[1]]), [None],
+            [FilterSettings(np.array([0.2]), scatter, each, 0.9, corrects=False)],
+        ).values
+        for each in (shift, 0.0)
+    )  # fmt: skip
+    np.testing.assert_allclose(with_shift, without, rtol=1e-9)
+
+
+def test_colours_of_means_go_on_over_those_that_are_left_out():
+    """Of two means that end in a sample the first is left out, not what the next has of it."""
+    ends = np.array([0.5, 1.5, 1.8, 2.6, 3.4])
+    windows = np.stack([np.append(0.0, ends[:-1]), ends], axis=1) - np.arange(5)[:, None]
+    colour = np.array([0.0, 0.9, 0.8, 0.5, 0.0])[:, None]
+    record = Dataset(
+        np.ones(5), np.ones(5), 1.0, windows=windows[:, None], jitter=np.full((5, 1), 0.1),
+        jitter_colour=colour,
+    )  # fmt: skip
+    once = each_mean_once(record)
+    assert np.isfinite(once.outputs[:, 0]).tolist() == [True, True, True, True, True]
+    np.testing.assert_allclose(once.jitter_colour[1:, 0], [0.0, 0.72, 0.5, 1e-3])
+
+
 def test_of_means_over_many_samples_innovations_are_those_of_their_joint_normal():
     """Each mean is a sum of the inputs' errors, and an innovation what none before tells of it."""
     rng = np.random.default_rng(1)
@@ -194,14 +264,20 @@ def test_jitter_of_windows_counts_by_how_fast_an_output_changes():
     """Means over windows that lie elsewhere than stated, drawn anew: their errors are as stated."""
     t, middles, deviation = DT * np.arange(N), DT * (np.arange(N) - 0.6), 0.25 * DT
     before, rng = np.tile([-1.0 * DT, -0.2 * DT], (N, 1)), np.random.default_rng(0)
-    jitter, slope, variances = np.full((N, 1), deviation), np.exp(-middles / TAU) / TAU, []
+    jitter, slope = np.full((N, 1), deviation), np.exp(-middles / TAU) / TAU
+    variances, shifts = [], []
     for _ in range(400):
         at = t + deviation * rng.standard_normal(N)
         means = np.diff([rising(at - DT)[1], rising(at - 0.2 * DT)[1]], axis=0)[0] / (0.8 * DT)
         record = Dataset(np.ones(N), means, DT, windows=before[:, None], jitter=jitter)
-        variances.append(scatter(record)[4:-4, 0])
-    expected = (deviation * slope[4:-4]) ** 2
-    assert 0.97 < np.mean(np.mean(variances, axis=0) / expected) < 1.03
+        found = scatter(record)
+        variances.append(found.variance[4:-4, 0])
+        shifts.append(found.shift[4:-4, 0])
+        assert np.all(found.shift**2 <= found.variance * (1.0 + 1e-9))
+    expected = deviation * slope[4:-4]
+    assert 0.97 < np.mean(np.mean(variances, axis=0) / expected**2) < 1.03
+    # And which way a mean that is later errs.
+    np.testing.assert_allclose(np.mean(shifts, axis=0), expected, rtol=0.1)
 
 
 def test_a_run_tells_how_outputs_bend_between_means():
@@ -222,7 +298,7 @@ def test_a_run_tells_how_outputs_bend_between_means():
         measured = means(before + deviation * rng.standard_normal((n, 1, 1)))
         record = Dataset(np.ones(n), measured, DT, windows=before, jitter=jitter)
         errors = (measured - means(before))[4:-4] ** 2
-        variances = (scatter(record, by)[4:-4, 0] for by in (run, None))
+        variances = (scatter(record, by).variance[4:-4, 0] for by in (run, None))
         parts.append([[np.mean(errors / s), np.mean(np.log(s))] for s in variances])
     (squares, logarithms), of_measured = np.mean(parts, axis=0)
     assert 0.85 < squares < 1.15
@@ -231,16 +307,25 @@ def test_a_run_tells_how_outputs_bend_between_means():
 
 
 def test_a_part_keeps_its_windows():
-    record = replace(averaged_step(), jitter=np.linspace(0.0, 1e-3, N)[:, None])
+    jitter = np.linspace(0.0, 1e-3, N)[:, None]
+    record = replace(averaged_step(), jitter=jitter, jitter_colour=1e3 * jitter)
     part = record.part(50, 90, "part")
     np.testing.assert_array_equal(part.windows, record.windows[50:90])
     np.testing.assert_array_equal(part.jitter, record.jitter[50:90])
+    np.testing.assert_array_equal(part.jitter_colour, record.jitter_colour[50:90])
 
 
 @pytest.mark.parametrize("jitter", [np.zeros(5), np.full((5, 1), -1.0), np.full((5, 1), np.nan)])
 def test_jitter_that_can_be_none_is_refused(jitter):
     with pytest.raises(ModelError, match=r"jitter must hold a finite number, 0 or more, for each"):
         Dataset(np.ones(5), np.zeros(5), DT, windows=np.zeros((5, 1, 2)), jitter=jitter)
+
+
+@pytest.mark.parametrize("colour", [np.zeros(5), np.full((5, 1), -0.1), np.full((5, 1), np.nan)])
+def test_a_colour_of_jitter_that_can_be_none_is_refused(colour):
+    windows = np.zeros((5, 1, 2))
+    with pytest.raises(ModelError, match=r"jitter_colour must hold a number from 0 to 1 for each"):
+        Dataset(np.ones(5), np.zeros(5), DT, windows=windows, jitter_colour=colour)
 
 
 @pytest.mark.parametrize(
