@@ -196,8 +196,8 @@ class Informant:
         of_outputs = self.variances(record, outputs[None])[0][:, counted]
         seeds = range(self._blocks)
         pushes = np.concatenate([self._pushes(record, vector, outputs, n, seed) for seed in seeds])
-        if not np.isfinite(pushes).all():
-            return _nothing(slopes)
+        if not np.isfinite(pushes).all():  # noise leads it to where no simulation does
+            return np.zeros((p, p))
         pushes, slopes = pushes[..., counted], slopes[:, counted].reshape(-1, p)
         variances = of_outputs + np.mean(pushes**2, axis=0)
         weighted = slopes / variances.reshape(-1, 1)
