@@ -104,8 +104,7 @@ def kalman_filter(
 
     noisy, driven: their places; averaged: places of outputs, as of ``FilterKernel``, whose model
     is ``with_integrals`` of them; coloured: whether the inputs' noise may be; jittered: whether
-    how late means were is not known. Raises ModelError for
-    equations that cannot be differentiated.
+    how late means were is not known. Raises ModelError for equations that cannot be differentiated.
     """
     varied = variation(model, noisy, driven)
     kernel = FilterKernel(model, varied, averaged, coloured=coloured, jittered=jittered)

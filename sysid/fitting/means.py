@@ -131,20 +131,19 @@ def scatter(record: Dataset, run: Run | None = None) -> Scatter:
         distinct, measured = rows[firsts], record.outputs[rows[firsts], j]
         plain = np.diff(measured) / apart
         level = np.zeros(len(distinct))
-        squares, rates = _squares(level, plain, excess), _mean_of_sides(level, plain)
+        sides = _sides(level, plain)
         if of_run is not None:
             means, slopes = (table[distinct, j] for table in of_run)
             beside = np.diff(measured - means) / apart
             straighter = _bend(beside) < _bend(plain)
-            squares = np.where(straighter, _squares(slopes, beside, excess), squares)
-            rates = np.where(straighter, _mean_of_sides(slopes, beside), rates)
+            sides = np.where(straighter, _sides(slopes, beside), sides)
+        squares = np.mean(sides**2 / _sides(level, excess), axis=0)
         squares = np.maximum(squares, _AROUND * _around(squares, _NEAR))
         place = np.searchsorted(firsts, np.arange(len(rows)), side="right") - 1
         variances[rows, j] = squares[place] * jitter**2
-        most = np.sqrt(squares[counts == 1])
-        alone = distinct[counts == 1]
-        rates = np.clip(rates[counts == 1], -most, most)
-        shifts[alone, j] = rates * record.jitter[alone, j]
+        most = np.sqrt(squares)
+        rates = np.where(counts == 1, np.clip(sides.mean(axis=0), -most, most), 0.0)
+        shifts[distinct, j] = rates * jitter[firsts]
     return Scatter(variances, shifts)
 
 
@@ -159,22 +158,13 @@ def _of_run(record: Dataset, run: Run) -> tuple[FloatArray, FloatArray]:
     return run(record), slopes
 
 
-def _squares(slopes: FloatArray, chords: FloatArray, excess: FloatArray) -> FloatArray:
-    """Mean squares, (n,), of the slopes to both sides: of a run, (n,), and of what is beside it.
+def _sides(slopes: FloatArray, chords: FloatArray) -> FloatArray:
+    """Slopes to both sides, (2, n): of a run, (n,), and of what is beside it.
 
-    chords: (n - 1,), of that from each to the next; excess: (n - 1,), by which factor squares are
-    too large for the jitter.
+    chords: (n - 1,), of that from each to the next.
     """
-    before, behind = (slopes[1:] + chords) ** 2 / excess, (slopes[:-1] + chords) ** 2 / excess
-    squares: FloatArray = 0.5 * (np.append(behind[0], before) + np.append(behind, before[-1]))
-    return squares
-
-
-def _mean_of_sides(slopes: FloatArray, chords: FloatArray) -> FloatArray:
-    """Means, (n,), of what ``_squares`` squares."""
     before, behind = slopes[1:] + chords, slopes[:-1] + chords
-    means: FloatArray = 0.5 * (np.append(behind[0], before) + np.append(behind, before[-1]))
-    return means
+    return np.array([np.append(behind[0], before), np.append(behind, before[-1])])
 
 
 def _bend(chords: FloatArray) -> FloatArray:

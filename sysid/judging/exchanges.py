@@ -138,16 +138,16 @@ def _with_exchanged(record: Dataset, side: Side, i: int, j: int) -> Dataset:
         outputs=_exchanged(record.outputs, i, j),
         output_noise=_exchanged(record.output_noise, i, j),
         output_zero=_exchanged(record.output_zero, i, j),
-        windows=_exchanged(record.windows, i, j, axis=1) if record.windows.size else record.windows,
-        jitter=_exchanged(record.jitter, i, j) if record.jitter.size else record.jitter,
-        jitter_colour=np.zeros(0)
-        if not record.jitter.size
-        else _exchanged(record.jitter_colour, i, j),
+        windows=_exchanged(record.windows, i, j, axis=1),
+        jitter=_exchanged(record.jitter, i, j),
+        jitter_colour=_exchanged(record.jitter_colour, i, j),
     )
 
 
 def _exchanged(values: FloatArray, i: int, j: int, axis: int = -1) -> FloatArray:
-    """Values of channels along an axis with two of them exchanged."""
+    """Values of channels along an axis with two of them exchanged, if there are any."""
+    if not values.size:
+        return values
     order = np.arange(values.shape[axis])
     order[[i, j]] = j, i
     return np.take(values, order, axis)
