@@ -3,7 +3,7 @@
 Slopes at the estimate tell how far a quantity may be from it, and how all else follows on the way
 d to an end. Two things are asked of simulations there:
 
-1. Residuals are to have changed about as slopes foretell.
+1. Residuals are to have changed about as slopes foretell, and their squares to have grown so.
 2. In a narrow valley that bends, the straight way ends high up its wall, however right the interval
    is. From the errors e there, a step b = -(H + mu I)^-1 sum_j w_j J_j' e_j that leaves the
    quantity where it is leads back, by the slopes J at the estimate, and so the next. What is lost
@@ -30,6 +30,8 @@ from sysid.uncertainty.tracer import Tracer
 _SIDES = (-1.0, 1.0)
 _AT_ONCE = 15  # ends that are simulated side by side
 _UNLIKE = 5.0  # times what slopes foretell, in squares, from where they are no guide
+# The root of what the squares grow by, in parts of what slopes foretell, where they are a guide.
+_NEAR = 0.8, 1.25
 _RESTORING = 1e-7  # mu in parts of the largest curvature, both in parts of the ranges
 _STEPS = 8  # back into a valley
 _SETTLED = 0.01  # of the root of the statistic, below which a step back does not matter any more
@@ -62,7 +64,7 @@ class SimulatedEnds:
     on_bound: BoolArray
 
     def as_foretold(self, tracers: Sequence[Tracer]) -> list[bool]:
-        """Whether residuals change about as slopes foretell, or that cannot be told.
+        """Whether residuals and their squares change about as foretold, or that cannot be told.
 
         It is not where slopes are not of the criterion, nor beyond the ranges, nor where something
         on an end of its range would follow.
@@ -79,8 +81,10 @@ class SimulatedEnds:
         alike = [True] * len(tracers)
         for k in range(0, len(ends), _AT_ONCE):
             batch = ends[k : k + _AT_ONCE]
-            for end, share in zip(batch, self._shares([end.point for end in batch]), strict=True):
-                alike[end.place] &= 1.0 / _UNLIKE < share < _UNLIKE
+            shares = zip(*self._shares([end.point for end in batch]), strict=True)
+            for end, (changed, grown) in zip(batch, shares, strict=True):
+                alike[end.place] &= 1.0 / _UNLIKE < changed < _UNLIKE
+                alike[end.place] &= _NEAR[0] ** 2 < grown < _NEAR[1] ** 2
         return alike
 
     def at_the_level(self, intervals: Sequence[tuple[Tracer, tuple[float, float]]]) -> list[bool]:
@@ -88,15 +92,16 @@ class SimulatedEnds:
 
         intervals: of tracers' quantities. Coordinates on an end of their range stay there.
         """
-        tracers = [tracer for tracer, _ in intervals]
+        tracers, bounds = (
+            [tracer for tracer, _ in intervals],
+            self.local.objective.space.coded_bounds,
+        )
         ends = [
-            _End(i, point, edge)
+            _End(i, np.clip(point, *bounds), edge)
             for i, (tracer, interval) in enumerate(intervals)
             for point, edge in zip(self._ends(tracer), interval, strict=True)
         ]
         alike = [True] * len(intervals)
-        for end in ends:
-            alike[end.place] &= self._is_inside(end.point)
         for _ in range(1 + _STEPS):
             live = [i for i, end in enumerate(ends) if alike[end.place] and not end.settled]
             for k in range(0, len(live), _AT_ONCE):
@@ -185,14 +190,23 @@ class SimulatedEnds:
         lower, upper = self.local.objective.space.coded_bounds
         return bool(np.all((point >= lower) & (point <= upper)))
 
-    def _shares(self, points: Sequence[FloatArray]) -> FloatArray:
-        """Sums of squares by which residuals change, in parts of what slopes foretell, (n,)."""
+    def _shares(self, points: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """What slopes foretell of residuals, and what simulations make of it, (n,) each.
+
+        In parts of it: sums of squares of their changes, and by how much the sum of their squares
+        is more than at the minimum that slopes foretell.
+        """
         local, space = self.local, self.local.objective.space
         rows = space.decode(np.stack([self._at, *points]))
         values = local.objective.residuals(rows, local.steps).values
         weight = self._weight[:, None]
         steps = np.stack(points, axis=1) - self._at[:, None]
+        foretold = local.slopes @ steps
         with np.errstate(all="ignore"):  # where a simulation failed
-            changes = np.sum(weight * (values[..., 1:] - values[..., :1]) ** 2, axis=(0, 1))
-            shares: FloatArray = changes / np.sum(weight * (local.slopes @ steps) ** 2, axis=(0, 1))
-        return shares
+            size = np.sum(weight * foretold**2, axis=(0, 1))
+            changes = values[..., 1:] - values[..., :1]
+            changed = np.sum(weight * changes**2, axis=(0, 1)) / size
+            slope = 2.0 * np.sum(weight * values[..., :1] * foretold, axis=(0, 1))
+            squares = np.sum(weight * values**2, axis=(0, 1))
+            grown = (squares[1:] - squares[0] - slope) / size
+        return changed, grown

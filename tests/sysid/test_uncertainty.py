@@ -1068,6 +1068,23 @@ def small_effect(p, u):
     return columns(p["a"] * u[:, 0] + 1e-2 * p["b"] * u[:, 1])
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_narrow_interval_whose_ends_lose_too_much_or_too_little_is_its_profiles(seed):
+    """Of a^10 the ends are known exactly; those by slopes of ln a are a third too near and far."""
+    problem = Problem(tenth_power, [unknown("a", 1.0)], sigma=8.5, inputs=1, seed=seed)
+    u, y = problem.records[0].inputs[:, 0], problem.records[0].outputs[:, 0]
+    best = float(u @ y) / float(u @ u)
+    half = Z * np.std(y - u * best) / np.sqrt(float(u @ u))
+    assert 0.4 < half / best < 0.9
+    result = estimates(problem.tell())["a"]
+    ends = np.log([result.low / result.value, result.high / result.value])
+    assert ends == pytest.approx(np.log1p([-half / best, half / best]) / 10.0, rel=0.05)
+
+
+def tenth_power(p, u):
+    return columns(p["a"] ** 10 * u[:, 0])
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_weak_parameter_has_the_ends_that_its_slope_gives(seed):
     """Of a logarithm of what may as well be zero the ends are those of least squares."""
