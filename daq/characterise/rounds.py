@@ -8,6 +8,7 @@ after a kill what is there is done, and the rest is done anew.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -189,9 +190,12 @@ class Round:
 
     def _ended(self, experiment: Path, status: str) -> list[Path]:
         """Folders of an experiment's runs that ended so."""
+        # A second run within a second has a number behind the name.
+        named = re.compile(rf".*-{re.escape(experiment.stem)}(-\d+)?")
         return [
             record.parent
             for record in sorted(self.runs.glob(f"*-{experiment.stem}*/{RUN_NAME}"))
+            if named.fullmatch(record.parent.name)
             if json_file.load(record, "record", "delete its folder").get("status") == status
         ]
 

@@ -156,6 +156,7 @@ class PlantBench:
                 return None
             # It refuses half of what is left, and takes less time than the slow ones.
             if k == 0 and self._lead_astray(inputs, dt, vectors, steps):
+                self.strays += 1
                 return None
             for name, values in measured.items():
                 signals.setdefault(name, np.empty((len(vectors), len(inputs))))[places] = values

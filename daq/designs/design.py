@@ -79,7 +79,7 @@ def design_files(
 
 def choose(setup: Setup, watch: Watch = ignore) -> Design:
     """The runs that tell most. Raises ConfigError where none can be made."""
-    question, settings, given = setup.question, setup.problem.settings, setup.problem.given
+    question, settings = setup.question, setup.problem.settings
     try:
         chosen = choose_runs(
             setup.problem.model,
@@ -91,8 +91,9 @@ def choose(setup: Setup, watch: Watch = ignore) -> Design:
             criterion=question.criterion,
             prior=setup.prior,
             ranges=settings.ranges,
-            fixed={**settings.fixed, **(given.values if given else {})},
+            fixed=setup.problem.fixed,
             tied=settings.tied,
+            scale=settings.scale,
             bench=setup.bench,
             draws=question.draws,
             checks=question.checks,

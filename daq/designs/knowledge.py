@@ -20,8 +20,8 @@ from sysid.experiments import Prior
 _VOLTS = 0.010  # rms at an analog input, where nothing tells more
 _COUNTS = 1.0 / 6.0  # of the count in a sample, by which a speed errs
 _TIMED = 0.03  # of that, beside what the instants of its edges do
-# Of how long the last edge was ago, to which an encoder's log tells it: parts of the time between
-# edges, of a sample at most, and of a sample where there is none in some.
+# To what a log tells how long the last edge was ago: in parts of the time between edges, and at
+# most of a sample; of a sample where some have no edge.
 _INTERVAL, _WAIT, _LONE = 0.6, 0.2, 0.05
 _NEVER = 1e3  # s, by which a sample may be off that tells of no time
 
@@ -29,7 +29,9 @@ _NEVER = 1e3  # s, by which a sample may be off that tells of no time
 def prior_of(space: SearchSpace, file: YamlFile | None) -> Prior:
     """What the ranges say, and beside them an earlier identification's result.
 
-    file: the result. Raises ConfigError for one of another model, or without numbers.
+    Of what the result had fixed, or found at an end of its range, the value alone is taken: how
+    well that holds the ranges say. file: the result. Raises ConfigError for one of another model,
+    or without numbers.
     """
     ranges = Prior.of_ranges(space)
     if file is None:
@@ -39,21 +41,25 @@ def prior_of(space: SearchSpace, file: YamlFile | None) -> Prior:
     if not names:
         problem = f"it has no parameter of model {model.name} that is searched"
         raise file.error(("parameters",), problem, "name a result of the same model")
-    places = [space.names.index(name) for name in names]
     values = ranges.values.copy()
-    values[places] = [stages.value(file, name, model) for name in names]
+    for name in names:
+        values[space.names.index(name)] = stages.value(file, name, model)
     values = np.clip(values, space.lower, space.upper)
-    changes = np.zeros((0, n_free))
-    rows = stages.factor(file, names, model)
-    if rows:
-        changes = np.zeros((len(rows), n_free))
-        changes[:, places] = rows
-        changes /= np.where(space.log, values, 1.0)
+    columns = file.content["covariance"].get("parameters")
+    searched = [n for n in names if not isinstance(columns, list) or n in columns]
+    rows = stages.factor(file, searched, model)
+    changes = np.zeros((len(rows), n_free))
+    changes[:, [space.names.index(name) for name in searched]] = np.reshape(
+        rows, (-1, len(searched))
+    )
+    changes /= np.where(space.log, values, 1.0)
+    places = np.flatnonzero(np.any(changes != 0.0, axis=0)).tolist()
     entries = file.content["parameters"]
     tied = [
         place
-        for place, name in zip(places, names, strict=True)
-        if isinstance(entries[name], dict) and entries[name].get("undetermined") == "tied"
+        for place in places
+        if isinstance(entry := entries[space.names[place]], dict)
+        if entry.get("undetermined") == "tied"
     ]
     return _together(space, ranges, Prior(values, changes.T @ changes), places, tied)
 
@@ -68,7 +74,7 @@ def _together(
     """
     block = np.ix_(places, places)
     widths, of_result = ranges.covariance[block], result.covariance[block]
-    # Neither is inverted: what no change moves has been told exactly, other things hardly at all.
+    # Neither is inverted: a result tells some things next to exactly, others hardly at all.
     share = np.linalg.solve(widths + of_result, of_result).T
     covariance = ranges.covariance.copy()
     covariance[block] = share @ widths

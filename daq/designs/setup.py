@@ -136,7 +136,7 @@ def _set_up_each(
     for name, problem in zip(names, problems, strict=True):
         parts = "" if name is None else name_parts(name)[2]
         plant = _plant(file, question, rig_name, device, turns, parts)
-        space = _space(file, problem)
+        space = problem.space
         earlier = result if name is None or _is_of(result, problem) else None
         identified = earlier is not None
         bench = PlantBench(problem.model, plant, rig, turns, margin, noise, timed, identified)
@@ -189,12 +189,6 @@ def _frame(file: YamlFile, question: Question, rig: RigConfig, shaft: Shaft | No
         raise file.error(("run",), problem, "make it shorter, or give more time")
     ranges = rig.limits.command
     return RunFrame(n_samples, question.rate, ranges.motor, ranges.brake, shaft)
-
-
-def _space(file: YamlFile, problem: Problem) -> SearchSpace:
-    settings, given = problem.settings, problem.given
-    fixed = {**settings.fixed, **(given.values if given else {})}
-    return SearchSpace.of(problem.model, settings.ranges, fixed, tied=settings.tied)
 
 
 def _plant(

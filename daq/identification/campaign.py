@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.errors import ConfigError, Terminated
-from daq.files import write_whole
+from daq.files import make_folder, write_whole
 from daq.identification import records
 from daq.identification.fit import assemble, check_writable, faults_of, load_logs, tell_starts
 from daq.identification.records import LoggedRecord
@@ -28,6 +28,7 @@ from sysid import Campaign, Dataset, ModelError, Outcome, Run
 from sysid import campaign as run_campaign
 
 _SEEDS_HELP = "write 0:10 for the seeds 0 to 9, or 3,5,8"
+_MOST_SEEDS = 1_000_000
 _WRITE_EVERY = 2.0  # s
 _TRACKER = "ignore::UserWarning:joblib.externals.loky.backend.resource_tracker"
 CONNECT_TIMEOUT = 10.0  # s to wait for a scheduler's answer
@@ -309,12 +310,17 @@ def parse_seeds(text: str | None) -> list[int]:
     try:
         if ":" in text:
             first, end = text.split(":")
-            seeds = list(range(int(first or 0), int(end)))
+            seeds: Sequence[int] = range(int(first or 0), int(end))
         else:
             seeds = [int(part) for part in text.split(",")]
+        problem = "" if seeds else f"{text!r} holds no seed"
+        if len(seeds) > _MOST_SEEDS:
+            raise ConfigError(
+                f"{text!r} makes {len(seeds)} seeds, of which {_MOST_SEEDS} are the most",
+                cure=_SEEDS_HELP, key="--seeds",
+            )  # fmt: skip
         outside = [seed for seed in seeds if not 0 <= seed < 2**32]
-        problem = f"{outside[0]} is outside 0 .. 4294967295" if outside else ""
-        problem = problem if seeds else f"{text!r} holds no seed"
+        problem = f"{outside[0]} is outside 0 .. 4294967295" if outside else problem
     except ValueError:
         problem = f"{text!r} is no list of seeds"
     if problem:
@@ -363,7 +369,7 @@ def _log_names(logs: Sequence[LoggedRecord]) -> list[str]:
 
 
 def _write_table(folder: Path, result: Campaign) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / "campaign.csv"
     write_whole(path, result.frame().to_csv(index=False, lineterminator="\n"))
     return path

@@ -27,7 +27,7 @@ from daq.logs.capture import LOG_NAME, VALIDATION
 from daq.logs.recording import Recording, log_path
 from daq.lookup.models import trust_option
 from daq.progress import Note, Progress, Watch, ignore, warn
-from sysid import EarlierMinima, ModelError, ProcessModel, SearchSpace
+from sysid import EarlierMinima, ModelError, ProcessModel
 from sysid.judging.lags import lag_faults
 from sysid.judging.plausibility import implausible, start_faults
 from sysid.problem.copies import shared_samples
@@ -237,7 +237,7 @@ def _tell_validation_runs(
 
 def _require_information(problem: Problem, train: Sequence[LoggedRecord]) -> None:
     """Raise ConfigError, before anything is written, for logs that determine nothing."""
-    names, n_free = problem.model.output_names, len(_space(problem).names)
+    names, n_free = problem.model.output_names, len(problem.space.names)
     try:
         require_information([log.dataset for log in train], names, n_free)
     except ModelError as error:
@@ -245,10 +245,13 @@ def _require_information(problem: Problem, train: Sequence[LoggedRecord]) -> Non
 
 
 def load_logs(problem: Problem, training: Sequence[Source], validation: Sequence[Source]) -> Split:
-    """Records for training and for validation; ConfigError when a log is given twice.
+    """Records for training and for validation; ConfigError for none, and when one is given twice.
 
     That is also what has the samples of another log under a name of its own.
     """
+    if not training:
+        cure = "name a run's folder, a CSV file, a recording or a table"
+        raise ConfigError("no log is given to train on", cure=cure)
     train = _records(training, "training", problem)
     check = _records(validation, "validation", problem)
     problem.selection.check_names([log.path for log in (*train, *check)])
@@ -332,20 +335,12 @@ def faults_of(problem: Problem, logs: Split) -> tuple[DataFault, ...]:
         units += placement_faults(model, records_of_part, part)
         datasets = [log.dataset for log in records_of_part]
         try:
-            units += implausible(model, _space(problem), datasets, part)
+            units += implausible(model, problem.space, datasets, part)
             units += start_faults(model, datasets, part)
         except ModelError as error:
             raise ConfigError(str(error)) from None
     late = lag_faults(model, [log.dataset for log in logs[0]])
     return (*units, *late, *faults)
-
-
-def _space(problem: Problem) -> SearchSpace:
-    settings = problem.settings
-    fixed = {**settings.fixed, **(problem.given.values if problem.given else {})}
-    return SearchSpace.of(
-        problem.model, settings.ranges, fixed, tied=settings.tied, scale=settings.scale
-    )
 
 
 def assemble(

@@ -63,9 +63,10 @@ class Cut:
 class LoggedRecord(Shown):
     """A log as a record for a model; warning: how a run that did not complete ended.
 
-    measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``; None
-    where that leaves none out. preparation: what was done to it before, None for nothing. merged:
-    files with columns of it. of_a_rig: whether it is a run's log, with all that a run logs.
+    measured: its record with the faulty samples that ``robust`` leaves out of ``dataset``, and of
+    a part of a prepared log as it was; None for what shows them itself. preparation: what was done
+    to it before, None for nothing. merged: files with columns of it. of_a_rig: whether it is a
+    run's log, with all that a run logs.
     """
 
     dataset: Dataset
@@ -368,8 +369,12 @@ def _halves(log: LoggedRecord, part: float) -> tuple[LoggedRecord, LoggedRecord]
                 file=log.path,
             )
         name = f"{whole.name} ({share})"
-        unmended = None if log.measured is None else log.measured.part(first, last, name)
-        halves.append(replace(log, dataset=whole.part(first, last, name), measured=unmended))
+        half = replace(log, dataset=whole.part(first, last, name))
+        if log.unmended is not whole:
+            scale = whole.dt / log.unmended.dt  # of a decimated log
+            unmended = log.unmended.part(round(first * scale), round(last * scale), name)
+            half = replace(half, measured=unmended)
+        halves.append(half)
     return halves[0], halves[1]
 
 

@@ -204,8 +204,7 @@ def short_names(replays: Sequence[Replay]) -> list[str]:
 def _declared(problem: Problem) -> dict[str, float]:
     """A model's own values, but for those that the settings fix, are given or tie."""
     model, settings = problem.model, problem.settings
-    fixed = {**settings.fixed, **(problem.given.values if problem.given else {})}
-    vector = model.vector(fixed)
+    vector = model.vector(problem.fixed)
     for tie in ties(model, settings.tied):
         vector[tie.index] = tie.factor * vector[tie.source]
     return dict(zip(model.parameter_names, vector.tolist(), strict=True))

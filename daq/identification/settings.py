@@ -60,6 +60,19 @@ class Problem:
         return f"<Problem: parameters of {self.model_name}>"
 
     @property
+    def fixed(self) -> dict[str, float]:
+        """Values that are not searched: of the settings, and what earlier identifications found."""
+        return {**self.settings.fixed, **(self.given.values if self.given else {})}
+
+    @property
+    def space(self) -> SearchSpace:
+        """Where the others are searched. Raises ModelError for what contradicts the model."""
+        chosen = self.settings
+        return SearchSpace.of(
+            self.model, chosen.ranges, self.fixed, tied=chosen.tied, scale=chosen.scale
+        )
+
+    @property
     def reading(self) -> list[str]:
         """Of what was typed as ``key=value`` all that says how logs are read."""
         keys = ("columns", *KEYS)

@@ -8,7 +8,7 @@ from daq.errors import ConfigError
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.lookup.models import title_of
-from sysid import Identifiability, ModelError, ProcessModel, SearchSpace, TiedGroup, identifiability
+from sysid import Identifiability, ModelError, ProcessModel, TiedGroup, identifiability
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,7 @@ def examine(request: SettingsRequest) -> Structure:
     """
     problem = problem_of(request)
     chosen = problem.settings
-    space = SearchSpace.of(
-        problem.model, chosen.ranges, chosen.fixed, tied=chosen.tied, scale=chosen.scale
-    )
-    model = space.as_model()
+    model = problem.space.as_model()
     try:
         result = identifiability(model, seed=chosen.seed)
     except ModelError as error:

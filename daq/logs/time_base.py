@@ -44,9 +44,10 @@ def time_base(
         dt = float(np.median(steps))
         counts = np.round(steps / dt)
     # A rate off by its printed digits drifts slowly; jumps between neighbours are what counts.
-    uneven = np.abs(steps / dt - counts) > _UNEVEN
+    uneven = (np.abs(steps / dt - counts) > _UNEVEN) | (counts < 1)
     row = int(np.argmax(uneven))
-    jump = f"samples are {dt:g} s apart elsewhere but {steps[row]:g} s for {counts[row]:g} of them"
+    count = max(int(counts[row]), 1)
+    jump = f"samples are {dt:g} s apart elsewhere but {steps[row]:g} s for {count} of them"
     refuse_rows(path, uneven, f"{jump} here", second_line, column, cure)
     ticks: IntArray = np.zeros(len(time), dtype=np.int64)
     ticks[1:] = np.cumsum(counts)

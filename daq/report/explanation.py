@@ -140,12 +140,13 @@ def _errors(
 
 def _log_rows(fingerprints: Sequence[Mapping[str, Any]], rows: Rows) -> list[dict[str, Any]]:
     """A row for every log: its length, and the errors of each output."""
-    errors = {(use, log.name): log.outputs for use, logs in rows.logs.items() for log in logs}
+    # Logs of several folders may have one name; of each use they stand in one order.
+    errors = {use: iter(logs) for use, logs in rows.logs.items()}
     return [
         {
             **{key: log[key] for key in ("name", "use", "samples")},
             "seconds": log["samples"] / log["sample_rate"],
-            "outputs": errors[log["use"], log["name"]],
+            "outputs": next(errors[log["use"]]).outputs,
         }
         for log in fingerprints
     ]

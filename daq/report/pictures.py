@@ -474,9 +474,13 @@ def _plots_of_model(subject: Subject) -> Iterator[Picture]:
 def _draws(subject: Subject) -> FloatArray:
     """Parameters drawn from their covariance, (n_draws, n_parameters); none where there is none."""
     model, covariance = subject.model, subject.document.get("covariance") or {}
-    names = [name for name in covariance.get("parameters", ()) if name in model.parameter_names]
+    columns = covariance.get("parameters") or ()
+    names = [name for name in columns if name in model.parameter_names]
     # Behind the parameters stand states at the start of a log.
-    factor = np.array(covariance.get("factor") or [], dtype=np.float64)[:, : len(names)]
+    rows = np.reshape(
+        np.array(covariance.get("factor") or [], np.float64), (-1, max(len(columns), 1))
+    )
+    factor = rows[:, : len(names)]
     return plausible_parameters(model, subject.vector, names, factor, _DRAWS, seed=0)
 
 

@@ -75,7 +75,10 @@ def ripple(theta: FloatArray, torque: FloatArray) -> Ripple:
 
 def _slope(omega: FloatArray, torque: FloatArray) -> float:
     """From the slowest to the fastest; NaN of a single plateau."""
-    return float(np.ptp(torque) / np.ptp(omega)) if len(omega) > 1 else math.nan
+    if len(omega) < 2:
+        return math.nan
+    slowest, fastest = np.argmin(omega), np.argmax(omega)
+    return float((torque[fastest] - torque[slowest]) / (omega[fastest] - omega[slowest]))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from sysid.experiments.search import RunCandidate, Search
 from sysid.identifiability import Combination, TiedGroup
 from sysid.identifiability.cache import kept_identifiability
 from sysid.problem.data import Dataset
-from sysid.problem.model import ModelError, ProcessModel
+from sysid.problem.model import ModelError, ProcessModel, Scale
 from sysid.problem.ranges import Range
 from sysid.problem.space import SearchSpace
 from sysid.threads import Workers, available_cores, one_thread
@@ -142,6 +142,7 @@ def design(
     ranges: Mapping[str, Range] | None = None,
     fixed: Mapping[str, float] | None = None,
     tied: Mapping[str, str] | None = None,
+    scale: Mapping[str, Scale] | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
     margin: float = 0.1,
     bench: Bench | None = None,
@@ -166,7 +167,8 @@ def design(
     default all that experiments can tell.
 
     prior: what is known, by default the model's ranges around its nominal values; before: (n_free,
-    n_free), information of runs that have been made. ranges, fixed, tied: as of an identification.
+    n_free), information of runs that have been made. ranges, fixed, tied, scale: as of an
+    identification.
     limits: (low, high) of inputs, states and outputs by name, which no run may pass with any of
     ``checks`` parameter vectors drawn from what is known; ``margin`` of them is kept. bench: what
     takes the place of these limits where a plant is not the model alone. draws: parameter vectors
@@ -192,7 +194,7 @@ def design(
     >>> result.duration, all(q.after < 0.02 < q.before for q in result.quantities)
     (2.0, True)
     """
-    space = SearchSpace.of(model, ranges, fixed, tied=tied)
+    space = SearchSpace.of(model, ranges, fixed, tied=tied, scale=scale)
     # Candidates are evaluated side by side, each by one thread.
     simulator = BatchSimulator(model, accuracy=accuracy, threads=1)
     coarse = BatchSimulator(model, accuracy=min(_COARSER * accuracy, _COARSEST), threads=1)

@@ -57,10 +57,18 @@ def chosen(
 def relative_gradients(
     quantities: Sequence[Combination], space: SearchSpace, chromosomes: FloatArray
 ) -> FloatArray:
-    """Derivatives by the search coordinates in parts of the values, (n, n_quantities, n_free)."""
+    """Derivatives by the search coordinates in parts of the values, (n, n_quantities, n_free).
+
+    Raises ModelError where a value is zero, of which there are no parts.
+    """
     return np.array([[_relative(q, space, row) for q in quantities] for row in chromosomes])
 
 
 def _relative(quantity: Combination, space: SearchSpace, chromosome: FloatArray) -> FloatArray:
     value = quantity.value(named_values(space, chromosome))
+    if value == 0.0:
+        raise ModelError(
+            f"{quantity.text}: a design tells intervals in parts of values, and this one is 0; "
+            "give it a nominal value of the size that it may have, or fix it"
+        )
     return coded_gradient(quantity, space, chromosome) / value

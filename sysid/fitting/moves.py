@@ -21,9 +21,8 @@ def moved_by(
     change: (n_residuals, n_outputs), in parts of the noise. in_noise: residuals of chromosomes
     (n, n_free) in these parts, (n_residuals, n_outputs, n). chromosome: (n_free,), about which.
     """
-    lower, upper = space.coded_bounds
     at = space.encode(chromosome)
-    inwards = np.where(at < 0.5 * (lower + upper), _STEP, -_STEP) * (upper - lower)
+    inwards = np.where(at < space.coded_lower + 0.5 * space.width, _STEP, -_STEP) * space.width
     values = in_noise(space.decode(np.vstack([at, at + np.diag(inwards)])))
     return float(np.linalg.norm(directions(values[..., 1:] - values[..., :1]).T @ change.ravel()))
 

@@ -227,6 +227,11 @@ def compare(
     best = int(np.argmin(score))
     ratios = _ratios(tested, best, importance) if tested else [None] * len(names)
     if np.isposinf(score[best]):
+        if n == 0 and any(runs.finite for runs in trained):
+            raise ModelError(
+                "no sample of the training records has all outputs measured, by which structures "
+                "are ranked without a validation; give a log to validate with"
+            )
         raise ModelError("no structure has a free run that stays finite")
     with np.errstate(invalid="ignore"):  # all may be infinite
         daic, dbic = (aic - aic.min()).tolist(), (bic - bic.min()).tolist()

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.arrays import FloatArray
-from sysid.problem.data import Dataset
+from sysid.problem.data import Dataset, of_one_rate
 from sysid.problem.faults import DataFault, Part
 from sysid.problem.model import ProcessModel
 from sysid.threads import one_thread
@@ -110,7 +110,7 @@ def lag_faults(
     model: ProcessModel, records: Sequence[Dataset], part: Part = "training"
 ) -> tuple[DataFault, ...]:
     """Faults of records by lags between their channels."""
-    if len({record.dt for record in records}) != 1:
+    if not of_one_rate(records):
         return ()
     return tuple(_faults(model, records, lags(records), part))
 

@@ -60,6 +60,7 @@ from sysid.judging.suspects import (
 )
 from sysid.judging.unseen import Possibility, possibilities
 from sysid.judging.whitener import Whitener
+from sysid.problem.data import of_one_rate
 from sysid.problem.terms import AddedTerm
 from sysid.threads import Workers
 from sysid.uncertainty import Estimate, Uncertainty
@@ -96,7 +97,6 @@ _EMPTIED = 3.0
 _EXACT = 1e-3  # share by which a gain may be off: an angle of many turns may tell far less
 _LEAST = 1e-6  # error of an output in parts of the largest, below which it weighs no more
 _FLAT = 0.999  # of what the best size of a delay explains, that is as good
-_SAME_RATE = 1e-3  # of a sample time
 _WHOLE = 0.2  # share by which a mean may seem to be longer or shorter than it is
 _NEARLY = 0.3  # of what the likeliest shape of a function explains, that a fit may turn round
 _SEEN = 4.2  # deviations of an amplitude by which it is found, as chance and number of tests ask
@@ -607,10 +607,10 @@ class _Tests:
         late, test = (regression.test(each, False) for each in (changes, averaged))
         if test is None or (late is not None and test.share < _AS_MUCH * late.share):
             return suspect, changes, result, residual
-        times = [record.dt for record in self._local.objective.records]
-        time = times[0]
+        records = self._local.objective.records
+        time = records[0].dt
         # Of logs of several rates no one time is that since the sample before.
-        alike = np.allclose(times, time, rtol=_SAME_RATE)
+        alike = of_one_rate(records)
         if not alike or abs(float(test.amplitudes[0]) / time - 1.0) > _WHOLE:
             return suspect, changes, result, residual
         left = self._left(averaged, test)

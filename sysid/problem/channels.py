@@ -286,8 +286,10 @@ def standstill(values: FloatArray, inputs: FloatArray, averaged: FloatArray) -> 
     (100, 50)
     """
     steps = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))
-    usual = float(np.nanmedian(steps))
     same = steps[1:-1] == 0.0
+    if not same.any():
+        return None
+    usual = float(np.nanmedian(steps))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     begins, lengths = edges[::2], edges[1::2] - edges[::2] + 1
     # It is caught in motion, at 0 where it might rest in fast motion, and jumps when it is free.

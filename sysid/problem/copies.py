@@ -52,7 +52,11 @@ def _rewritten(record: Dataset, source: Dataset) -> float:
     short, long = record, source
     if record.n_samples > source.n_samples:
         short, long = source, record
-    place = _place(short.outputs[:, 0], long.outputs[:, 0])
+    measured = [np.isfinite(each.outputs).any(axis=0) for each in (short, long)]
+    if not (measured[0] & measured[1]).any():
+        return 0.0
+    j = int(np.argmax(measured[0] & measured[1]))
+    place = _place(short.outputs[:, j], long.outputs[:, j])
     part = long.outputs[place : place + short.n_samples]
     return short.n_samples / record.n_samples if _same(short.outputs, part) else 0.0
 
@@ -75,6 +79,8 @@ def _same(outputs: FloatArray, originals: FloatArray) -> bool:
     moves = False
     for y, original in zip(outputs.T, originals.T, strict=True):
         both = np.isfinite(y) & np.isfinite(original)
+        if not both.any():
+            continue
         difference = np.abs(y - original)[both].max(initial=0.0)
         if difference > 0.1 * np.nanstd(original):
             return False

@@ -11,6 +11,8 @@ from sysid.arrays import BoolArray, FloatArray
 from sysid.problem.channels import noise
 from sysid.problem.model import AROUND_FIRST_SAMPLE, ModelError, ProcessModel
 
+_SAME_RATE = 1e-3  # of a sample time
+
 
 @dataclass(frozen=True, repr=False)
 class Dataset:
@@ -293,3 +295,12 @@ def output_scale(datasets: list[Dataset], per_log: bool = False) -> list[FloatAr
     if not per_log:
         peaks = np.broadcast_to(peaks.max(axis=0), peaks.shape)
     return [np.where(peak > 0.0, peak, 1.0) for peak in peaks]
+
+
+def of_one_rate(records: Sequence[Dataset]) -> bool:
+    """Whether records have one sample time; times that logs print make it a little uneven.
+
+    >>> of_one_rate([Dataset(np.zeros(2), np.zeros(2), dt) for dt in (0.001, 0.00099999)])
+    True
+    """
+    return bool(np.allclose([record.dt for record in records], records[0].dt, rtol=_SAME_RATE))

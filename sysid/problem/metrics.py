@@ -12,6 +12,7 @@ import numpy as np
 from sysid.arrays import BoolArray, FloatArray
 
 FITTED = 50.0  # fit [%] below which a model explains little
+_ROUNDING = 1e-12
 
 
 def rmse(
@@ -42,11 +43,16 @@ def fit_percent(measured: FloatArray, simulated: FloatArray) -> FloatArray:
     >>> y = np.array([[1.0], [3.0]])
     >>> fit_percent(y, y).tolist(), fit_percent(y, 0.0 * y + 2.0).tolist()
     ([100.0], [0.0])
+    >>> fit_percent(np.full((1000, 1), 0.1), np.zeros((1000, 1))).tolist()
+    [nan]
     """
     spread = rmse(measured, _mean(measured, measured))
+    rounding = _ROUNDING * np.sqrt(
+        _mean(measured**2, measured)
+    )  # of the mean of what never changes
     with np.errstate(divide="ignore", invalid="ignore"):
         fit = 100.0 * (1.0 - rmse(measured, simulated) / spread)
-    return np.where(spread > 0.0, fit, np.nan)
+    return np.where(spread > rounding, fit, np.nan)
 
 
 def mean_known(

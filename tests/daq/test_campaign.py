@@ -208,6 +208,7 @@ def test_seeds_are_a_range_or_a_list(text, seeds):
     [
         (["--seeds", "5:5"], "--seeds: '5:5' holds no seed; write 0:10"),
         (["--seeds", "a"], "--seeds: 'a' is no list of seeds; write 0:10"),
+        (["--seeds", "0:4000000000"], "makes 4000000000 seeds, of which 1000000 are the most"),
         (["--seeds=-1"], "--seeds: -1 is outside 0 .. 4294967295"),
         (["--jobs", "0"], "--jobs: 0 runs at a time do nothing; give 1 or more"),
         (["--model", LAG], f"--model: {LAG} is given twice"),

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import yaml
@@ -234,6 +235,26 @@ def test_a_person_is_asked_for_the_mounting_that_tells_more(folder):
     first, second, *_ = rounds_of(folder / "c")
     assert (folder / "rig.yaml").samefile(first.rig)
     assert (folder / "free.yaml").samefile(second.rig)
+
+
+def test_runs_are_those_of_an_experiment_whose_name_begins_another(tmp_path):
+    """designed-1 of a round of ten runs or more; two within a second have a number behind."""
+    runs = tmp_path / "round-1" / "runs"
+    for k, (name, status) in enumerate(
+        [
+            ("designed-1", "interlock"),
+            ("designed-10", "completed"),
+            ("designed-1-2", "interlock"),
+            ("designed-11", "completed"),
+        ]
+    ):
+        folder = runs / f"2026010{k + 1}T000000Z-{name}"
+        folder.mkdir(parents=True)
+        (folder / "run.json").write_text(json.dumps({"status": status}))
+    first = Round(tmp_path, 1)
+    assert first.stops(Path("designed-1.yaml")) == 2
+    assert first.is_left_out(Path("designed-1.yaml"))
+    assert len(first.captures(Path("designed-10.yaml"))) == 1
 
 
 @pytest.mark.parametrize(

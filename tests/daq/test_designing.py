@@ -441,6 +441,28 @@ def test_prior_from_a_result_has_its_deviations(tmp_path):
     assert setup.prior.covariance[np.ix_(order, order)] == pytest.approx(exact, rel=0.02)
 
 
+def test_of_what_a_result_had_fixed_or_at_an_end_the_value_alone_is_taken(tmp_path):
+    write_yaml(tmp_path / "id.yaml", few_free())
+    value, units = {"R_m": 1.1, "K_m": 0.15, "B_m": 2e-4}, ("ohm", "N*m/A", "N*m*s/rad")
+    entries = {
+        name: {"value": value[name], "unit": unit} for name, unit in zip(value, units, strict=True)
+    }
+    entries["R_m"]["fixed"] = True
+    covariance = {"parameters": ["K_m", "B_m"], "factor": [[0.003, 0.0]]}
+    result = {"parameters": entries, "covariance": covariance}
+    (tmp_path / "result.yaml").write_text(yaml.safe_dump(result))
+    files = {name: str(tmp_path / f"{name}.yaml") for name in ("id", "result")}
+    ranges = set_up(TypedSettings.of({"config": files["id"]})).prior
+    setup = set_up(TypedSettings.of({"config": files["id"], "parameters": files["result"]}))
+    known, names = setup.prior, setup.space.names
+    order = [names.index(name) for name in value]
+    assert known.values[order] == pytest.approx([*value.values()], rel=1e-3)
+    before, after = (np.sqrt(np.diag(each.covariance))[order] for each in (ranges, known))
+    assert after == pytest.approx([before[0], 0.02, before[2]], rel=1e-3)
+    assert np.isfinite(known.information()).all()
+    assert len(known.draws(setup.space, 3, np.random.default_rng(0))) == 3
+
+
 def test_of_what_a_result_hardly_tells_ranges_decide_as_much(tmp_path):
     write_yaml(tmp_path / "id.yaml", few_free())
     files = {name: str(tmp_path / f"{name}.yaml") for name in ("id", "result")}

@@ -197,3 +197,8 @@ def test_the_notebook_does_what_it_shows(tmp_path, monkeypatch):
         source = "".join(cell["source"]).replace("seed=0", "**QUICK")
         exec(source, names)
     assert names["found"].parameters.loc["K_m", "unit"] == "N*m/A"
+
+
+def test_no_log_at_all_is_refused_in_words():
+    with pytest.raises(ConfigError, match="no log is given to train on; name a run's folder"):
+        identify([])

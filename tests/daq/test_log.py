@@ -16,6 +16,7 @@ from daq.identification import records as datasets
 from daq.logs.columns import COLUMNS, ORIGINAL_COLUMNS
 from daq.logs.recording import load
 from daq.logs.table import read_table
+from daq.logs.time_base import time_base
 from daq.logs.writer import LogWriter
 from sim_rig.actuator import actuator
 from tests.daq.support import (
@@ -481,3 +482,11 @@ def test_a_last_cell_without_a_number_costs_no_row_in_a_column_that_is_not_read(
     path.write_text("t,y,remark\n0,1.5,ok\n1,2.5,nan\n")
     table, _, torn = read_table(path, ["t", "y"])
     assert table["y"].tolist() == [1.5, 2.5] and not torn
+
+
+def test_a_row_between_two_samples_is_refused_with_its_line():
+    time = np.array([0.0, 0.1, 0.2, 0.21, 0.3, 0.4])
+    with pytest.raises(
+        ConfigError, match=r"log\.csv:5: t: samples are 0\.1 s apart elsewhere but "
+    ):
+        time_base(Path("log.csv"), time)

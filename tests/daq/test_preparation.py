@@ -12,7 +12,7 @@ import yaml
 from daq import ConfigError
 from daq.files import digest
 from daq.identification import records
-from daq.identification.fit import identify_files
+from daq.identification.fit import identify_files, load_logs
 from daq.identification.request import SettingsRequest
 from daq.identification.settings import problem_of
 from daq.report.publication import publish
@@ -60,6 +60,21 @@ def test_a_decimated_record_gives_the_parameters_of_the_whole():
     # Every tenth sample as it stands folds what is faster than the new rate into the signals.
     thinned = fitted(Dataset(record.inputs[::10], record.outputs[::10], 10 * DT))
     assert abs(thinned["gain"] / GAIN - 1.0) > 0.05
+
+
+@pytest.mark.parametrize(("words", "scale"), [(["detrend.y=constant"], 1), (["decimate=10"], 10)])
+def test_what_is_held_back_of_a_prepared_log_is_no_copy(tmp_path, words, scale):
+    (tmp_path / "lag.py").write_text("from sysid.examples import lag\nmodel = lag()\n")
+    between_levels(130, 23).to_csv(tmp_path / "log.csv", index=False)
+    settings = ["hold_back=0.3", *words]
+    request = SettingsRequest(None, {"model": str(tmp_path / OF_LAG["model"])}, settings)
+    made = problem_of(request)
+    begins, ends = records.hold_back(load_logs(made, [tmp_path / "log.csv"], [])[0], 0.3)
+    for log in (*begins, *ends):
+        assert log.unmended.n_samples == pytest.approx(scale * log.dataset.n_samples, abs=scale)
+    assert sum(log.unmended.n_samples for log in (*begins, *ends)) <= 130 * 23
+    parts = [[log.unmended for log in logs] for logs in (begins, ends)]
+    assert "copy" not in [fault.kind for fault in data_faults(made.model, *parts)]
 
 
 def test_the_low_pass_stops_what_would_fold_into_its_passband():

@@ -11,7 +11,7 @@ from daq.errors import ConfigError, RunError
 from daq.experiment import Sample
 from daq.hal import Samples
 from daq.run.plan import plan
-from protocols.analysis.plateau_findings import ripple
+from protocols.analysis.plateau_findings import _slope, ripple
 from protocols.analysis.torque_curve import Level, Motor, fit, levels_of
 from protocols.constant_velocity import ConstantVelocity
 from protocols.control.loop import Pid, SpeedTracker, VelocityGains, VelocityServo
@@ -157,6 +157,12 @@ def test_a_run_cut_short_concludes_from_what_it_has(between):
     np.testing.assert_array_equal(
         found.tables[1].columns["torque"][:6], whole.tables[1].columns["torque"][:6]
     )
+
+
+def test_a_torque_that_falls_with_the_speed_has_a_slope_below_zero():
+    """As of friction that is largest at rest."""
+    assert _slope(np.array([5.0, 10.0]), np.array([2.0, 1.0])) == pytest.approx(-0.2)
+    assert _slope(np.array([-10.0, 10.0]), np.array([-3.0, 1.0])) == pytest.approx(0.2)
 
 
 def test_a_brake_command_with_a_single_plateau_has_no_slope_across(between):

@@ -319,3 +319,13 @@ def test_only_what_the_data_determine_counts():
     assert result.row("twofold").verdict in ("best", "as good")
     assert result.preferred in ("lag", "twofold")
     assert result.row("lag").dbic == pytest.approx(result.row("twofold").dbic, abs=1e-3)
+
+
+def test_outputs_that_are_never_measured_at_once_are_no_free_runs_that_fail():
+    outputs = np.random.default_rng(0).standard_normal((40, 2))
+    outputs[::2, 0], outputs[1::2, 1] = np.nan, np.nan
+    records = [Dataset(np.zeros(40), outputs, 0.01)]
+    run = np.zeros((40, 2))
+    candidates = [Candidate(name, 1, 1, (run,), ()) for name in "ab"]
+    with pytest.raises(ModelError, match="no sample of the training records has all outputs"):
+        compare(candidates, records, [])

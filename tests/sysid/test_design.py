@@ -275,3 +275,14 @@ def test_excitations_of_a_single_setting_have_offspring():
     for seed in range(3):
         result = design(lag(), [step], noise=NOISE, seed=seed, **(QUICK | {"offspring": 12}))
         assert result.runs[0].settings["height"] == pytest.approx(2.0, rel=0.1)
+
+
+def test_parts_of_a_value_that_is_zero_are_refused_by_its_name():
+    rest = Parameter("rest", "m", 0.0, -1.0, 1.0, minimum=-2.0)
+    model = replace(
+        lag().with_parameters(b={"fixed": True}),
+        parameters=(*lag().with_parameters(b={"fixed": True}).parameters, rest),
+        derivative=lambda x, u, p: ((p[0] * p[1] * u[0] + p[3] - x[0]) / p[2],),
+    )
+    with pytest.raises(ModelError, match="rest: a design tells intervals in parts of values"):
+        design(model, [SQUARE], noise=NOISE, precision=0.05, **QUICK)

@@ -454,3 +454,15 @@ def test_a_record_that_begins_where_no_start_is_searched_is_named():
     assert start_faults(starting(low, high), [at_rest, moving]) == ()
     assert start_faults(starting(-0.1, 0.1), [at_rest]) == ()
     assert start_faults(model(), [moving]) == ()
+
+
+def test_logs_of_other_outputs_are_no_copies():
+    """Of an output that one of them does not measure nothing tells that it is the other's."""
+    rng, missing = np.random.default_rng(0), np.full(400, np.nan)
+    model = lag(states=(State("y", "1"), State("w", "1")),
+                outputs=(Output("y", "1"), Output("w", "1")),
+                derivative=lambda x, u, p: (-x[0], -x[1]))  # fmt: skip
+    first, second = (rng.standard_normal((400, 2)).cumsum(axis=0) for _ in range(2))
+    first[:, 1], second[:, 0] = missing, missing
+    records = [Dataset(rng.standard_normal(400), y, 0.01) for y in (first, second)]
+    assert "copy" not in [fault.kind for fault in data_faults(model, records, [])]

@@ -32,6 +32,13 @@ def test_a_lag_is_told_with_its_size(name, lag):
     assert lag in lags(training)
 
 
+def test_logs_whose_times_round_to_rates_apart_by_the_last_digit_lag_alike():
+    case = CASES["speed ten samples late"]
+    first, second = (case.records(seed)[0][0] for seed in range(2))
+    records = [first, replace(second, dt=first.dt * (1.0 - 1e-13))]
+    assert [fault.channel for fault in lag_faults(MODEL, records)] == ["omega"]
+
+
 @pytest.mark.parametrize(
     "case", mostly_soak([*CORRECT, *MORE_CORRECT], always=8), ids=lambda case: case.name
 )

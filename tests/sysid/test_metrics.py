@@ -26,6 +26,7 @@ def test_fit_by_hand():
     assert fit[0] == pytest.approx(100.0 * (1.0 - np.sqrt(1.0 / 29.0)))
     assert np.isnan(fit[1])  # a constant has no spread to explain
     assert fit_percent(MEASURED, MEASURED)[0] == 100.0
+    assert np.isnan(fit_percent(np.full((1000, 1), 0.1), np.zeros((1000, 1)))).all()
     mean = np.broadcast_to(MEASURED.mean(axis=0), MEASURED.shape)
     assert fit_percent(MEASURED, mean)[0] == pytest.approx(0.0)
 

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid import Constraint, ModelError, Parameter, SearchSpace
+from sysid.fitting.moves import moved_by
 from tests.sysid.support import lag
 
 MIXED = (
@@ -279,3 +280,16 @@ def test_what_is_searched_starts_between_its_bounds(scale, ends, which):
     if which != "low":
         assert space.hard_upper[0] == space.upper[0] == high
     assert (space.violations(np.stack([space.lower, space.upper])) == 0.0).all()
+
+
+@pytest.mark.parametrize("upper", [4.0, None])
+def test_what_a_change_moves_is_told_of_a_range_with_an_open_end(upper):
+    """Residuals are 10 times the logarithm of the gain, and 20 times that of tau."""
+    space = SearchSpace.of(lag(), ranges={"gain": (1.0, upper)})
+    slopes, change = np.array([[10.0, 0.0], [0.0, 20.0]]), np.array([[3.0], [4.0]])
+
+    def in_noise(chromosomes):
+        return (slopes @ space.encode(chromosomes).T)[:, None, :]
+
+    at = np.array([2.0, 0.05])
+    assert moved_by(change, in_noise, space, at) == pytest.approx(5.0)
