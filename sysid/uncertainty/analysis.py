@@ -24,7 +24,7 @@ from sysid.uncertainty.covariance import covariance, larger
 from sysid.uncertainty.ends import RangeEnds
 from sysid.uncertainty.estimate import Z95, Estimate, Invariant, Why
 from sysid.uncertainty.quantities import Coordinate, Expression
-from sysid.uncertainty.sensitivity import Sensitivity, bend_errors, sensitivity
+from sysid.uncertainty.sensitivity import Sensitivity, bend_errors, has_tangents, sensitivity
 from sysid.uncertainty.simulated_ends import SimulatedEnds
 from sysid.uncertainty.ties import Ties, change, coded_gradient, named_values, ties
 from sysid.uncertainty.tracer import Fit, Tracer
@@ -192,7 +192,7 @@ def uncertainty(
     if doubted.any() and objective.free_run is objective and not objective.exact_slopes:
         # Differences may have been too far for a valley so narrow.
         exact = objective.with_exact_slopes()
-        if exact.exact_slopes:
+        if has_tangents(exact, chromosome):
             return uncertainty(exact, chromosome, rivals, ridge, structure, profiled)
     bottoms = [_Analysis(sensitivity(objective, point), analysis.ties) for point in ridge]
     others = list(analysis.unlike(rivals))

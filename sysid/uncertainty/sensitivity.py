@@ -21,6 +21,9 @@ _FILTER_PERTURBATION = 1e-6  # the same where kinks make a filter jump: fewer li
 # Part of the larger slopes by which those of both sides differ where there is a kink between them,
 # and how many times as far one looks then which of them a jump has made.
 _KINK, _FARTHER = 0.01, 100.0
+# Of slopes, in parts of the outputs' scale and of a logarithm, or of a unit: beyond it the tangents
+# of a stiff simulation, that chatters in small bounds itself, have grown without any.
+_BLOWN_UP = 1e12
 _JUMP = 10.0  # times that a slope is larger by the shorter distance, from where on it is a jump
 # Realisations of the inputs' noise in all records together, and the fewest of one record: they
 # give a variance to within 12 % and 25 %.
@@ -126,7 +129,7 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     """
     if objective.exact_slopes:
         exact = _by_tangents(objective, chromosome)
-        if np.isfinite(exact.slopes).all():
+        if _are_slopes(exact.slopes):
             return exact
     share: FloatArray | float = 1.0
     criterion, corrects = objective, filters(objective)
@@ -159,6 +162,15 @@ def sensitivity(objective: Objective, chromosome: FloatArray) -> Sensitivity:
     return Sensitivity(
         objective, chromosome, steps, residual, seen, slopes, factors, sides < 2, criterion
     )
+
+
+def has_tangents(objective: Objective, chromosome: FloatArray) -> bool:
+    """Whether exact slopes are those of its simulations at a chromosome, (n_free,)."""
+    return objective.exact_slopes and _are_slopes(_by_tangents(objective, chromosome).slopes)
+
+
+def _are_slopes(slopes: FloatArray) -> bool:
+    return bool(np.abs(slopes).max(initial=0.0) < _BLOWN_UP)  # never where one is NaN
 
 
 def _by_tangents(objective: Objective, chromosome: FloatArray) -> Sensitivity:

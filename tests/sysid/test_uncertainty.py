@@ -9,6 +9,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ from sysid.uncertainty.colour import Autoregression, colour, score_covariance
 from sysid.uncertainty.covariance import covariance
 from sysid.uncertainty.estimate import Z95
 from sysid.uncertainty.quantities import Coordinate
-from sysid.uncertainty.sensitivity import sensitivity
+from sysid.uncertainty.sensitivity import has_tangents, sensitivity
 from sysid.uncertainty.ties import Ties, ties
 from sysid.uncertainty.tracer import Fit, Tracer
 from tests.sysid.support import Formula, lag, linear_response, prbs
@@ -1452,3 +1453,17 @@ def test_what_to_measure_on_the_actuator_resolves_it(rig_minimum, rig_result):
     after = uncertainty(*rig_objective(record, start, fixed=measure))
     assert not after.ambiguities
     assert {e.why for e in after.parameters} <= {"", "vague"}
+
+
+@pytest.mark.parametrize("size", [1e15, 1e200, np.inf])
+def test_tangents_that_have_grown_without_bounds_are_no_slopes(monkeypatch, size):
+    """As those of a stiff friction do, around which a simulation chatters in small bounds."""
+    space, nominal = SearchSpace.of(lag()), lag().nominal
+    objective = Objective(BatchSimulator(lag()), space, [lag_record(np.random.default_rng(4))])
+    expected = sensitivity(objective, nominal).slopes
+    exact = objective.with_exact_slopes()
+    assert has_tangents(exact, nominal)
+    grown = SimpleNamespace(dense=np.full(expected.shape, size))
+    monkeypatch.setattr(Objective, "tangents", lambda *_: [grown])
+    assert not has_tangents(exact, nominal)
+    assert sensitivity(exact, nominal).slopes == pytest.approx(expected, rel=1e-5)
