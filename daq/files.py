@@ -19,7 +19,8 @@ def write_whole(path: Path, content: str | bytes) -> None:
         reason = error.strerror
         if not path.parent.is_dir():
             reason = f"there is no folder {path.parent}, make it first"
-        raise RunError(f"cannot be written: {reason}", file=path) from None
+        cure = "name another place, or make room there"
+        raise RunError(f"cannot be written: {reason}", cure=cure, file=path) from None
 
 
 def require_target(path: Path, suffix: str) -> None:
@@ -37,7 +38,9 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def make_folder(folder: Path, exist_ok: bool = True) -> None:
+def make_folder(
+    folder: Path, exist_ok: bool = True, cure: str = "choose a folder with --out"
+) -> None:
     """Make a folder and what leads to it; ConfigError with the cure when that is impossible.
 
     Raises FileExistsError where it must be new and is not.
@@ -49,5 +52,4 @@ def make_folder(folder: Path, exist_ok: bool = True) -> None:
         if is_file and not exist_ok:
             raise
         reason = "File exists" if is_file else error.strerror
-        cure = "choose a folder with --out"
         raise ConfigError(f"cannot be created: {reason}", cure=cure, file=folder) from None

@@ -190,7 +190,7 @@ def resume(
             command = f"rig characterise --resume {shlex.quote(str(root))}"
             command += " --ask" * (ask is not None)
             again = "; what limits stop twice is left out" * isinstance(stop, InterlockError)
-            stop.add_note(f"what was done until then is kept; go on with: {command}{again}")
+            stop.add_note(f"what was done so far is kept; go on with: {command}{again}")
         raise
 
 
@@ -277,8 +277,9 @@ def _end(request: Request, done: Sequence[Round], result: Mapping[str, Any] | No
     spent = _spent(done)
     if spent + done[-1].seconds / len(done[-1].experiments) > request.time * (1.0 + 1e-9):
         left = request.time - spent
-        short = f", but for {left:.3g} s, less than a run" if left > 1e-3 * request.time else ""
-        return f"the {request.time:g} s are used up{short}"
+        if left > 1e-3 * request.time:
+            return f"the {left:.3g} s that are left of {request.time:g} s are shorter than a run"
+        return f"the {request.time:g} s are used up"
     return ""
 
 

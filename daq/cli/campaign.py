@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from typer import Option
+from typer import Exit, Option
 
 from daq.cli import options, terminal
 
@@ -65,6 +65,8 @@ def campaign(
         terminal.print_json(result.document)
     else:
         _show(result)
+    if result.campaign.interrupted:
+        raise Exit(1)
 
 
 def _show(result: CampaignResult) -> None:

@@ -186,8 +186,9 @@ def _rival_row(row: ParameterRow, rivals: Sequence[RivalRow]) -> list[str]:
     answers += [(r.values[row.name], r.intervals.get(row.name, (None, None))) for r in rivals]
     cells = [row.text(value, scale) for value, _ in answers]
     for k, (_, ends) in enumerate(answers):
-        written = ["?" if end is None else row.text(end, scale) for end in ends]
-        cells[k] += f" ({written[0]} .. {written[1]})"
+        low, high = ("" if end is None else row.text(end, scale) for end in ends)
+        interval = f"{low} .. {high}" if low and high else f"< {high}" if high else f"> {low}"
+        cells[k] += f" ({interval})" if low or high else " (no interval)"
     return [row.name, *cells, unit]
 
 
@@ -298,7 +299,7 @@ def _show_notes(result: Identification) -> None:
     if result.interrupted:
         terminal.print_text(
             f"Stopped by Ctrl-C after {len(result.estimator.history_)} generations: "
-            "these are the best parameters until then."
+            "these are the best parameters so far."
         )
     pushed = [row.name for row in rows.free if row.pushed and not row.at_limit]
     if pushed:

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from typer import BadParameter, Context, Option
+from typer import BadParameter, Context, Exit, Option
 
 from daq.cli import options, terminal
 from daq.cli.identification import drafting, show_comparison, show_identification
@@ -73,14 +73,21 @@ def identify(
     from daq.identification.request import SettingsRequest
 
     if resume is not None:
-        if any(context.params[name] for name in context.params if name not in _WITH_RESUME):
+        words = [
+            "LOG" if name == "logs" else f"--{name.replace('_', '-')}"
+            for name, value in context.params.items()
+            if value and name not in _WITH_RESUME
+        ]
+        if words:
             raise BadParameter(
-                "--resume goes on as it was asked; give nothing but --json, --no-report or --trust"
+                "--resume goes on as it was asked, with --json, --no-report or --trust at most; "
+                f"leave out {' and '.join(words)}"
             )
         with drafting(report) as draft:
             with terminal.watching(json) as watch:
                 result = fit.resume(resume, watch, trust=trust, draft=draft)
-            _finish(show_identification(result, report, json, draft=draft), json)
+            document = show_identification(result, report, json, draft=draft)
+        _finish(document, json, result.interrupted)
         return
     if not logs:
         raise BadParameter("name the logs to identify from, or a folder with --resume")
@@ -106,15 +113,18 @@ def identify(
         )
         with terminal.watching(json) as watch:
             compared = compare(wanted, watch)
-        _finish(show_comparison(compared, report, json), json)
+        _finish(show_comparison(compared, report, json), json, compared.campaign.interrupted)
         return
     request = replace(request, options={**chosen, "model": model[0] if model else None})
     with drafting(report) as draft:
         with terminal.watching(json) as watch:
             result = fit.identify_files(logs, validate or [], request, out, watch, draft)
-        _finish(show_identification(result, report, json, draft=draft), json)
+        document = show_identification(result, report, json, draft=draft)
+    _finish(document, json, result.interrupted)
 
 
-def _finish(document: dict[str, Any], json: bool) -> None:
+def _finish(document: dict[str, Any], json: bool, stopped: bool) -> None:
     if json:
         terminal.print_json(document)
+    if stopped:
+        raise Exit(1)

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from sysid import ProcessModel, TiedGroup
     from sysid.problem.model import Parameter, State
 
+_DECADES = 100.0  # between what acts and what does not, beyond which the latter is nothing at all
+
 
 def models(
     name: Annotated[
@@ -101,8 +103,10 @@ def _show_identifiable(structure: Structure) -> None:
         print()
         if math.isfinite(result.gap):
             terminal.print_text(
-                "Sure to rounding: the least effect that counts as one is "
+                "No case is doubtful: the least effect that counts as one is "
                 f"1e{result.gap:.0f} times the largest that does not."
+                if result.gap < _DECADES
+                else "No case is doubtful: what does not act has no effect at all."
             )
         terminal.print_next("rig identify LOG --set fixed.NAME=VALUE, with what was measured")
 

@@ -47,7 +47,7 @@ _KINDS = {
 
 def write_reference(folder: Path, command: Any) -> list[Path]:
     """Write all pages; the paths written. ConfigError when they cannot be."""
-    make_folder(folder)
+    make_folder(folder, cure="name another folder")
     watch = terminal.report_event
     controllers = schemas.controllers(watch)
     texts = pages(schemas.protocols(watch), schemas.backend_options(watch), controllers, command)

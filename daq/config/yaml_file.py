@@ -103,11 +103,18 @@ class TypedSettings(YamlFile):
     ) -> Self:
         """Options by name without their dashes, and settings as ``key.key=value``.
 
-        Raises ConfigError for a setting that is not of that form.
+        Raises ConfigError for a setting that is not of that form, or that an option gives as well.
         """
         typed: dict[str, Any] = dict(options)
         for text in settings:
-            typed = merge(typed, _setting(text))
+            setting = _setting(text)
+            (name, value), *_ = setting.items()
+            if options.get(name) is not None and not isinstance(value, dict):
+                option = f"--{name.replace('_', '-')}"
+                raise ConfigError(
+                    f"{option} gives it as well", cure="keep one of them", key=f"--set {name}"
+                )
+            typed = merge(typed, setting)
         path = file.path if file else Path(_TYPED)
         content = merge(file.content if file else {}, typed)
         places, repeated = (file.places, file.repeated) if file else ({}, ())

@@ -129,8 +129,10 @@ def _set_up_each(
     first, rate = problems[0].model, question.rate
     noise = noise_of(file, question.noise, rig, first, rate, recording)
     if recording is None and not question.noise:
-        shown = ", ".join(f"{name} {deviation:.2g}" for name, deviation in noise.items())
-        watch(Note("note", f"noise is assumed: {shown}; --log RUN takes a calibration's"))
+        units = {s.name: s.unit for s in first.inputs} | {s.name: s.unit for s in first.outputs}
+        shown = ", ".join(f"{name} {size:.2g} {units[name]}" for name, size in noise.items())
+        cure = "rig design --log RUN takes a calibration's"
+        watch(Note("note", f"noise is assumed: {shown}; {cure}"))
     timed, margin = SPEED not in question.noise, question.margin / 100.0
     setups = []
     for name, problem in zip(names, problems, strict=True):

@@ -177,7 +177,7 @@ def fit(
     except (KeyboardInterrupt, Terminated) as stop:
         if folder is not None and (folder / request.CHECKPOINT).exists():
             command = request.resume_command(folder) + trust_option(problem.model_name)
-            stop.add_note(f"the search until then is kept; go on with: {command}")
+            stop.add_note(f"the search so far is kept; go on with: {command}")
         raise
     if folder is not None:
         result.save(folder)

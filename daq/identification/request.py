@@ -49,9 +49,10 @@ class SettingsRequest:
     def words(self, settings: Sequence[str] = (), **options: Any) -> list[str]:
         """Words of ``rig identify`` behind its logs that ask for the same, but for what is given.
 
-        >>> asked = SettingsRequest("drive.yaml", {"seed": 1, "guess": True}, ["robust=true"])
-        >>> " ".join(asked.words(["delay.omega=4 ms"], model="lag"))
-        '--config drive.yaml --model lag --seed 1 --guess --set robust=true --set delay.omega=4 ms'
+        >>> typed = ["robust=true", "population=80"]
+        >>> asked = SettingsRequest("drive.yaml", {"guess": True}, typed)
+        >>> " ".join(asked.words(["delay.y=2"], model="lag", population=160))
+        '--config drive.yaml --model lag --guess --population 160 --set robust=true --set delay.y=2'
         """
         words = self.config_words
         whole = {**self.options, **options}
@@ -60,7 +61,7 @@ class SettingsRequest:
                 if each is not None and each is not False:
                     words.append(f"--{name.replace('_', '-')}")
                     words += [] if each is True else [from_here(str(each))]
-        replaced = {setting.partition("=")[0] for setting in settings}
+        replaced = {*options, *(setting.partition("=")[0] for setting in settings)}
         kept = [s for s in self.settings if s.partition("=")[0] not in replaced]
         return [*words, *(word for setting in (*kept, *settings) for word in ("--set", setting))]
 

@@ -129,19 +129,20 @@ def _cells(path: Path, text: str, layout: Layout) -> pd.DataFrame:
                 skip_blank_lines=False,
                 on_bad_lines="error",
             )
-    except pd.errors.ParserWarning:
+    except (pd.errors.ParserWarning, pd.errors.ParserError) as error:
         lines = text.splitlines()
         n_columns = len(layout.names)
         counts = [line.count(layout.separator) + 1 for line in lines]
-        row = next((i for i in range(layout.line, len(lines)) if counts[i] > n_columns), 0)
-        raise ConfigError(
-            f"{counts[row]} cells, but line {layout.line} names {n_columns} columns",
-            cure="separate cells by commas and write decimals with a point, or separate them by "
-            "semicolons",
-            file=path,
-            line=row + 1,
-        ) from None
-    except pd.errors.ParserError as error:
+        longer = [i for i in range(layout.line, len(lines)) if counts[i] > n_columns]
+        if longer or isinstance(error, pd.errors.ParserWarning):
+            row = longer[0] if longer else 0
+            raise ConfigError(
+                f"{counts[row]} cells, but line {layout.line} names {n_columns} columns",
+                cure="separate cells by commas and write decimals with a point, or separate them "
+                "by semicolons",
+                file=path,
+                line=row + 1,
+            ) from None
         reason = str(error).removeprefix("Error tokenizing data. C error: ").strip()
         raise ConfigError(f"not a table: {reason}", file=path) from None
 

@@ -58,7 +58,7 @@ def without_schema_comment(text: str) -> str:
 
 def write_schemas(folder: Path, watch: Watch = ignore) -> list[Path]:
     """One file for each kind of YAML; the paths written. ConfigError when they cannot be."""
-    make_folder(folder)
+    make_folder(folder, cure="name another folder")
     paths = []
     every = documents(protocols(watch), backend_options(watch), controllers(watch))
     for kind, schema in every.items():

@@ -58,7 +58,7 @@ def write_starter(folder: Path, protocol: str | None, rig: str, watch: Watch = i
     texts |= {path.name: path.read_text(encoding="utf-8") for path in tables if path.exists()}
     texts[RIG] = _copy(rigs, first_rig if hardware else rig, "rig", "rig")
     texts[SETTINGS] = settings_text()
-    make_folder(folder)
+    make_folder(folder, cure="name another folder")
     written = [folder / name for name, text in texts.items() if _write_new(folder / name, text)]
     kept = [folder / name for name in texts if folder / name not in written]
     schemas.write_schemas(folder / schemas.FOLDER, watch)

@@ -254,8 +254,7 @@ class _Run:
         late = self.sampling.timing.flags.get("held", 0)
         punctuality = f", {late} commands came too late" if late else ""
         error.add_note(
-            f"what was recorded until then: {self.capture.folder} ({n} samples of the run"
-            f"{punctuality})"
+            f"what was recorded so far: {self.capture.folder} ({n} samples of the run{punctuality})"
         )
         if self.outputs is not None:
             error.add_note(self.outputs.text)

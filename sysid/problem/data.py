@@ -265,9 +265,9 @@ def require_information(datasets: list[Dataset], names: Sequence[str], n_free: i
     where = ", ".join(record.name for record in datasets[:3]) + ", ..." * (len(datasets) > 3)
     if n_values <= n_free:
         raise ModelError(
-            f"{where}: too short, with {n_values} measured value{'s' * (n_values != 1)} behind the "
-            f"first row for {n_free} unknown{'s' * (n_free != 1)}; give a longer record, or fix "
-            "parameters"
+            f"{where}: too short: after its first sample it has {n_values} measured "
+            f"value{'s' * (n_values != 1)}, for {n_free} unknown{'s' * (n_free != 1)}; give a "
+            "longer record, or fix parameters"
         )
     lowest = np.where(np.isfinite(outputs), outputs, np.inf).min(axis=0)
     highest = np.where(np.isfinite(outputs), outputs, -np.inf).max(axis=0)

@@ -189,7 +189,7 @@ def test_ctrl_c_keeps_what_is_finished(folder):
     until((folder / "found" / "campaign.csv").exists, "the first finished run")
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 0, err
+    assert process.returncode == 1, err
     document = json.loads(out)
     assert document["interrupted"] and 1 <= len(document["runs"]) < 5000
     assert len(pd.read_csv(folder / "found" / "campaign.csv")) == len(document["runs"])

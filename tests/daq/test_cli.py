@@ -556,7 +556,7 @@ def test_ctrl_c_during_a_search_prints_the_parameters_found_so_far(captured, tmp
         root,
         interrupt,
     )
-    assert asked and status == 0, text + out
+    assert asked and status == 1, text + out
     assert "Stopped by Ctrl-C after" in out and "Parameters of actuator" in out
     assert "Traceback" not in text
     kept = yaml.safe_load((tmp_path / "o" / "parameters.yaml").read_text("utf-8"))

@@ -266,7 +266,7 @@ def test_sigterm_while_identifying_says_what_is_kept_and_how_to_go_on(data):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert errors.splitlines()[-2:] == [
-        "rig: the search until then is kept; go on with: rig identify --resume found --trust",
+        "rig: the search so far is kept; go on with: rig identify --resume found --trust",
         "rig: stopped by SIGTERM",
     ]
 

@@ -176,7 +176,7 @@ def test_an_answer_that_is_none_ends_the_run_and_names_sample_and_folder(
     assert "failed at sample 50: " in str(failed.value) and says in str(failed.value)
     folder = only_capture(tmp_path)
     assert failed.value.__notes__ == [
-        f"what was recorded until then: {folder.relative_to(tmp_path)} (50 samples of the run)",
+        f"what was recorded so far: {folder.relative_to(tmp_path)} (50 samples of the run)",
         "both outputs are zero: read back from the device",
     ]
     ended = record_of(folder)

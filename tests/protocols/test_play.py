@@ -91,7 +91,7 @@ GOOD = "time,motor,brake\n0,0,0\n0.00125,1,0\n0.0025,1,0.1\n0.00375,1,0.1\n"
         (GOOD.replace("0.0025,1", "0.001,1"), "c.csv:4: time: time does not advance"),
         (GOOD.replace("0.00375", "0.0375"), "c.csv:5: 0.035 s after the row before, but rows"),
         (GOOD.removesuffix(",0.1\n"), "c.csv:5: the last line has no end"),
-        (GOOD + "0.005,1,0.1,7\n", "c.csv: not a table: Expected 3 fields in line 6, saw 4"),
+        (GOOD + "0.005,1,0.1,7\n", "c.csv:6: 4 cells, but line 1 names 3 columns"),
         (GOOD.replace("0.00", "0.0"), "c.csv: its rows are at 80 Hz, not at the sample_rate"),
         (GOOD.replace("1,0.1", "9,0.1"), "motor: the plan asks for 9 V in sample 2, outside"),
     ],

@@ -49,7 +49,7 @@ def test_constant_outputs_of_several_records_explain_what_differs():
 
 def test_a_record_shorter_than_what_is_sought_determines_nothing():
     record = Dataset(np.ones(2), np.array([0.0, 1.0]), 0.1, "short")
-    wrong = "short: too short, with 1 measured value behind the first row for 2 unknowns; give a"
+    wrong = "short: too short: after its first sample it has 1 measured value, for 2 unknowns"
     with pytest.raises(ModelError, match=wrong):
         GASSI(lag(), population=10, generations=1).fit(record)
 
