@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 # A difference of BIC above this is very strong evidence (Kass & Raftery, "Bayes factors",
 # J. American Statistical Association 90, 1995).
 _STRONG = 10.0
+_MOST = 0.5  # of the residuals' squares
 _SEARCHED = 0.25  # of a search's simulations, which a variant is given
 
 
@@ -151,7 +152,11 @@ class _Suspected:
 
 
 def _suspected(findings: Sequence[Finding], model: ProcessModel) -> dict[str, _Suspected]:
-    """Models to be fitted by name, the surest first."""
+    """Models to be fitted by name, the surest first.
+
+    None with a term behind what explains most and is no term: fitted without that it would stand
+    for it, as a cube of an input does for its saturation.
+    """
     variants = variants_of(model)
     for finding in findings:
         if finding.kind == "variant":
@@ -160,6 +165,8 @@ def _suspected(findings: Sequence[Finding], model: ProcessModel) -> dict[str, _S
             within = [name for name, between in parts.items() if least < between < most]
             return {name: _Suspected(variants[name]) for name in (finding.name, *within)}
     for finding in findings:
+        if finding.term is None and finding.share > _MOST:
+            return {}
         if finding.term is not None and finding.counts:
             terms = (finding.term, *finding.rivals)
             try:
