@@ -567,7 +567,7 @@ def _disagreement(uncertainty: Uncertainty, logs: int) -> Iterator[str]:
         parts = "Logs" if logs > 1 else "Parts of the log"
         yield (
             f"{parts} want parameters of their own, {ratio:.1f} times as far apart as noise "
-            "explains: something is missing that is not the same throughout."
+            "explains: something is missing, or changes."
         )
 
 

@@ -92,6 +92,7 @@ def free_shaft():
     return set_up(TypedSettings.of(asked | {"time": "2.5 s", "run": "2.5 s"}, [], None))
 
 
+@pytest.mark.soak
 def test_what_the_model_is_given_of_a_loop_is_what_the_rig_would_log(tmp_path, free_shaft):
     config, device = load_rig("free_shaft.yaml", {"ideal": True})
     model = actuator(load="free", sensor="between", parameters="rig")

@@ -191,6 +191,7 @@ model = ProcessModel(
 """
 
 
+@pytest.mark.soak
 def test_gaps_of_an_output_do_not_take_away_the_frequency_response_of_another(tmp_path, rig):
     (tmp_path / "lags.py").write_text(TWO_LAGS)
     signals = ["u: {column: u}", "y: {column: y}", "z: {column: z}"]

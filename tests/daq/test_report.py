@@ -330,6 +330,7 @@ def test_a_calibration_that_makes_no_sense_is_refused(captured, record, case):
     assert str(path) in said and "'calibration'" in said and "delete it to go without" in said
 
 
+@pytest.mark.soak
 def test_the_ends_of_amplifiers_are_named_with_what_rests_on_them(command, captured):
     root = captured.parent
     (root / "few.yaml").write_text(yaml.safe_dump(few_free("R_b", limits=True)))
@@ -364,6 +365,7 @@ def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captur
     assert not any("(0)" in label for label in labels)
 
 
+@pytest.mark.soak
 def test_starts_of_many_logs_are_a_line_and_no_parameters(command, tmp_path):
     (tmp_path / "hidden.py").write_text(
         "from sysid import Input, Output, Parameter, ProcessModel, State\n"

@@ -17,6 +17,7 @@ from daq.report.page import Picture
 from daq.report.publication import draw
 from sysid.examples import lag_record
 from sysid.judging.score_tests import ScoreTests
+from tests.soak import mostly_soak
 
 
 def pictures():
@@ -82,7 +83,9 @@ def problem(monkeypatch, tmp_path):
     return problem_of(SettingsRequest(None, settings))
 
 
-@pytest.mark.parametrize(("ends", "report"), [(False, True), (False, False), (True, True)])
+@pytest.mark.parametrize(
+    ("ends", "report"), mostly_soak([(False, True), (False, False), (True, True)])
+)
 def test_what_the_model_may_lack_is_found_as_by_one(monkeypatch, problem, ends, report):
     alone = fit(problem, [Path("log.csv")], [])
     here, tests = [], ScoreTests.__init__

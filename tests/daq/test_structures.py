@@ -42,6 +42,7 @@ def test_each_structure_has_a_plant_of_its_own(plant):
     assert np.abs(speeds[0] - speeds[1]).max() > 0.1
 
 
+@pytest.mark.soak
 def test_a_model_with_a_load_and_amplifiers_ends_may_be_that_of_the_structures():
     model = "actuator:limits=true,load=pulley,turns=5"
     several = setups(structures={"hysteresis": ["dahl", "lugre"]}, model=model)

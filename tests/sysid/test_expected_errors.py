@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from sysid import BatchSimulator, Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.examples import lag, lag_record
@@ -90,6 +91,7 @@ def summing() -> ProcessModel:
     )
 
 
+@pytest.mark.soak
 def test_a_sum_of_an_inputs_noise_is_as_often_so_large_as_is_told():
     """Most of a random walk's mean square is one slow swing: three times the mean is no rarity."""
     n, dt, rng = 400, 0.01, np.random.default_rng(5)

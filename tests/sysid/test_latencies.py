@@ -8,6 +8,7 @@ from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
 from sysid.gassi import GASSI
 from sysid.judging.examination import suspected
 from sysid.problem.preparation import Preparation, prepare
+from tests.soak import mostly_soak
 
 TRUTH = {"R": 2.3, "L": 1.1e-3, "K": 0.035, "J": 2.1e-5, "B": 4e-5}
 UNITS = dict(zip(TRUTH, ("ohm", "H", "N*m/A", "kg*m^2", "N*m*s/rad"), strict=True))
@@ -53,7 +54,7 @@ def fitted(record):
     return estimator, estimator.uncertainty([record])
 
 
-@pytest.mark.parametrize("late", [0.1, 0.3, 0.7])
+@pytest.mark.parametrize("late", mostly_soak([0.3, 0.1, 0.7]))
 def test_a_driver_that_is_late_is_named_with_what_it_moves(late):
     record = log(late, seed=1)
     estimator, uncertainty = fitted(record)

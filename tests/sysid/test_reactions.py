@@ -98,6 +98,7 @@ def log_of_means(seed):
     return replace(record, outputs=means[:, None], windows=windows)
 
 
+@pytest.mark.soak
 def test_what_runs_between_samples_is_no_fault_of_a_channel():
     """Torques are no straight lines there, and a speed whose drive steps is no parabola."""
     record = log_of_means(0)
