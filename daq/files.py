@@ -1,6 +1,7 @@
 """Files and folders written for a user: whole or not at all, with the cure where it fails."""
 
 import contextlib
+import datetime
 import hashlib
 from pathlib import Path
 
@@ -31,6 +32,15 @@ def require_target(path: Path, suffix: str) -> None:
     if not path.parent.is_dir():
         problem = f"cannot be written: there is no folder {path.parent}, make it first"
         raise ConfigError(problem, cure="or choose another place with --out FILE", file=path)
+
+
+def stamp(now: datetime.datetime | None = None) -> str:
+    """A time, by default the present, with which names of folders begin, in UTC.
+
+    >>> stamp(datetime.datetime(2026, 1, 31, 12, tzinfo=datetime.UTC))
+    '20260131T120000Z'
+    """
+    return f"{now or datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
 
 
 def digest(path: Path) -> str:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
         """Rate of the hysteresis variable [1/s]."""
 
 
-MOST_AHEAD = 20
 MOST_SUBSTEPS = 64
 SUBSTEP = 0.5  # largest change of z, in parts of its range, by one Runge-Kutta step
 BY_MOTOR, BY_HEATING, BY_STICTION = 0, 1, 2  # preferences

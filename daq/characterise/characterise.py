@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from daq.designs.files import DATA
 from daq.designs.setup import Setup, set_up
 from daq.diagnose.sampling import fastest, kept_up_with
 from daq.errors import ConfigError, DeviceError, InterlockError, RigError, Terminated
-from daq.files import make_folder
+from daq.files import make_folder, stamp
 from daq.hal import Device
 from daq.identification.fit import check_writable, fit
 from daq.identification.request import CHECKPOINT, SettingsRequest
@@ -150,8 +149,7 @@ def characterise(
         ask is not None,
     )
     _, device = load_rig(str(rig), watch=watch)
-    now = datetime.datetime.now(datetime.UTC)
-    folder = Path(out) if out is not None else Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-characterise"
+    folder = Path(out) if out is not None else Path("runs") / f"{stamp()}-characterise"
     check_writable(folder)
     questions = [
         set_up(_question(request, mounted, [], request.time), watch).question

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from daq.designs.runs import progress_of, write_runs
 from daq.designs.setup import Setup, set_up, set_up_structures
 from daq.documents import plain
 from daq.errors import ConfigError
-from daq.files import write_whole
+from daq.files import stamp, write_whole
 from daq.identification.fit import check_writable
 from daq.progress import Note, Watch, ignore
 from sysid import Design, ModelError
@@ -67,7 +66,7 @@ def design_files(
         check.refuse_other_kind(written, "a design's question")
     typed = {key: value for key, value in options.items() if value is not None}
     file = TypedSettings.of(typed, settings, written)
-    folder = out or Path("designs") / _stamp()
+    folder = out or Path("designs") / stamp()
     if file.content.get("structures"):
         setups = set_up_structures(file, watch)
         _check_new(folder)
@@ -156,8 +155,3 @@ def _check_new(folder: Path) -> None:
     check_writable(folder)
     if (folder / DATA).exists() or any(folder.glob("designed-*.yaml")):
         raise ConfigError("a design is there", cure="choose another with --out", file=folder)
-
-
-def _stamp() -> str:
-    now = datetime.datetime.now(datetime.UTC)
-    return f"{now:%Y%m%dT%H%M%SZ}"

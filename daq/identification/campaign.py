@@ -1,7 +1,6 @@
 """Campaigns: every log with every model and every seed, over cores or a cluster."""
 
 import dataclasses
-import datetime
 import math
 import os
 import time
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.errors import ConfigError, Terminated
-from daq.files import make_folder, write_whole
+from daq.files import make_folder, stamp, write_whole
 from daq.identification import records
 from daq.identification.fit import assemble, check_writable, faults_of, load_logs, tell_starts
 from daq.identification.records import LoggedRecord
@@ -181,8 +180,7 @@ def campaign(wanted: CampaignRequest, watch: Watch = ignore) -> CampaignResult:
     """
     groups = _all_groups(wanted, watch)
     seeds = parse_seeds(wanted.seeds) or [groups[0].problem.settings.seed]
-    now = datetime.datetime.now(datetime.UTC)
-    folder = wanted.out or Path("campaigns") / f"{now:%Y%m%dT%H%M%SZ}"
+    folder = wanted.out or Path("campaigns") / stamp()
     check_writable(folder)
     outcomes: list[Outcome] = []
     written = -math.inf

@@ -15,6 +15,7 @@ import numpy as np
 
 from daq.config import yaml_file
 from daq.errors import ConfigError, Terminated
+from daq.files import stamp
 from daq.identification import records, request
 from daq.identification.foreign import ColumnMapping
 from daq.identification.placement import placement_faults
@@ -291,8 +292,7 @@ def default_folder(logs: Sequence[Path], model: str) -> Path:
     # A folder without a log.csv stands for the CSVs in it, and is no place for results.
     if len(logs) == 1 and first.name == LOG_NAME and first.exists():
         return first.parent / "identification"
-    now = datetime.datetime.now(datetime.UTC)
-    return Path("runs") / f"{now:%Y%m%dT%H%M%SZ}-identify-{model}" / "identification"
+    return Path("runs") / f"{stamp()}-identify-{model}" / "identification"
 
 
 def check_writable(folder: Path) -> None:

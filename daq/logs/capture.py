@@ -17,7 +17,7 @@ from typing import Any
 from daq.config import json_file
 from daq.config.metadata import Metadata
 from daq.errors import ConfigError, RunError
-from daq.files import make_folder, write_whole
+from daq.files import make_folder, stamp, write_whole
 from daq.logs.metadata import write_metadata
 from daq.process import RunProcess
 from daq.provenance import software_versions
@@ -62,7 +62,7 @@ class Capture:
             "process": None if process is None else process.document,
         }
         kept = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).strip("-.")
-        folder = _new_folder(root, f"{now:%Y%m%dT%H%M%SZ}-{kept or 'run'}")
+        folder = _new_folder(root, f"{stamp(now)}-{kept or 'run'}")
         capture = cls(folder, facts)
         try:
             capture.save()

@@ -6,7 +6,6 @@ They are made of what a model's function may hold, and so may be called in one.
 import math
 
 CELSIUS = 273.15  # K, of 0 degrees
-RPM = 2.0 * math.pi / 60.0  # rad/s
 
 
 def limited(x: float, low: float, high: float) -> float:
