@@ -1,5 +1,6 @@
 """Experiments by the names that users write."""
 
+import difflib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -57,8 +58,12 @@ def load_experiment(name: str, watch: Watch = ignore) -> LoadedExperiment:
     protocol_name = file.content.get("protocol")
     try:
         if not isinstance(protocol_name, str):
-            problem = "this key is missing or not a name"
-            raise ConfigError(problem, cure="for example 'protocol: prbs'")
+            problem, keys = "this key is missing or not a name", list(map(str, file.content))
+            near = difflib.get_close_matches("protocol", keys, n=1)
+            cure = "for example 'protocol: prbs'"
+            if near and near != ["protocol"]:
+                cure = f"is {near[0]!r} meant to be it?"
+            raise ConfigError(problem, cure=cure)
         protocol = find_class("protocol", protocol_name, file.path.parent)
     except ConfigError as error:
         check.validate(file, _common_settings(), others=file.blamed(("protocol",), error))
