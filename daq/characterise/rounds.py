@@ -165,7 +165,7 @@ class Round:
 
     @property
     def seconds(self) -> float:
-        """Logged time of its runs [s]."""
+        """Logged time of its runs, also of those that are left out [s]."""
         return float(self.design["duration_seconds"])
 
     def captures(self, experiment: Path) -> list[Path]:

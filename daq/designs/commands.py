@@ -60,8 +60,8 @@ def experiments_of(name: str) -> list[str]:
 def commands_behind(experiments: Sequence[Path], out: Path | None) -> list[str]:
     """What serves after runs of a design, into a folder: the identification from all of them.
 
-    Before they are run, out None, and after a part of them: all runs and then that. None where they
-    are of no single design, or where its commands are for another working folder.
+    Before they are run, out None, and after a part of them: all runs and then that. Empty where
+    they are of no single design, or where its commands are for another working folder.
     """
     folders = {experiment.parent for experiment in experiments}
     folder = folders.pop()

@@ -40,7 +40,8 @@ class Replay(Shown):
 
     model_title: what to call the model. time: (n,) [s]. measured, simulated: (n, n_outputs) in the
     outputs' units. source: where the parameters come from. warning: how the logged run ended if it
-    did not complete. config: what gave a model by name values that are not its own.
+    did not complete. config: what gave a model by name values that are not its own. by_name:
+    whether the source is a model's name.
 
     >>> from daq import record, replay
     >>> result = replay(record("prbs.yaml"))
@@ -58,13 +59,14 @@ class Replay(Shown):
     metrics: Metrics
     warning: str | None
     config: Path | None = None
+    by_name: bool = False
 
     @property
     def title(self) -> str:
         """The model, and where its parameters come from."""
-        if self.source.partition(":")[0] == self.model.name:
+        if self.by_name:
             values = "at its own values" if self.config is None else f"with values of {self.config}"
-            return f"{self.source} {values}"
+            return f"{self.model_title} {values}"
         return f"{self.model_title} with the parameters of {self.source}"
 
     @property
@@ -146,7 +148,10 @@ def replay(
     True
     """
     file, valued = None if config is None else Path(config), None
-    if parameters is None and (model is not None or (file is not None and _sets_values(file))):
+    by_name = parameters is None and (
+        model is not None or (file is not None and _sets_values(file))
+    )
+    if by_name:
         request = SettingsRequest(None if file is None else str(file), {"model": model}, settings)
         problem = problem_of(request)
         chosen, values, source = problem.model, _declared(problem), problem.model_name
@@ -180,6 +185,7 @@ def replay(
         metrics,
         logged.warning,
         valued,
+        by_name,
     )
 
 

@@ -24,7 +24,7 @@ def write_mat(recording: Recording, path: Path) -> None:
 
     ``units`` is a structure of texts by column, ``record`` what run.json holds, as its text
     (``jsondecode(record)``); time is in seconds from the run's start, as in the log. Raises
-    ConfigError where the file cannot be written.
+    RunError where the file cannot be written.
     """
     from scipy.io import savemat
 
@@ -39,7 +39,7 @@ def write_mat(recording: Recording, path: Path) -> None:
 def write_parquet(recording: Recording, path: Path) -> None:
     """A Parquet table: ``unit`` in each column's metadata, ``dt`` and ``record`` in the table's.
 
-    Raises ConfigError where the file cannot be written, or pyarrow is missing.
+    Raises RunError where the file cannot be written, ConfigError where pyarrow is missing.
     """
     try:
         import pyarrow as pa

@@ -19,8 +19,8 @@ def plausible_parameters(
 ) -> FloatArray:  # fmt: skip
     """Parameters drawn from a covariance with all its ties, (at most n, n_parameters).
 
-    factor: (m, len(names)), whose product with its transpose is the covariance of the named ones:
-    what acts only together moves together. Positive parameters move by factors. A covariance is
+    factor: F of the covariance F' F of the named ones, (m, len(names)): what acts only together
+    moves together. Positive parameters move by factors. A covariance is
     straight, and in factors a tie such as J_m + J_b is not: what the equations let outputs
     determine is brought to where the covariance wants it. Draws that break the model's constraints,
     or that have no such place, are left out.

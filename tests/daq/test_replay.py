@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import yaml
 
+from daq import replay
 from sim_rig.actuator import actuator
 from sim_rig.plant import Plant
 from tests.daq.support import environment, forked_rig, only_capture, write_experiment, write_rig
@@ -253,3 +254,15 @@ def test_a_rig_that_is_another_fails_and_the_seed_is_told(lab):
     assert result.returncode == 1
     assert "2 failed, 1 passed" in result.stdout
     assert "--rig-seed 5" in result.stdout
+
+
+def test_a_model_of_a_file_is_replayed_at_its_own_values_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("lag.py").write_text("from sysid.examples import lag\nmodel = lag()\n")
+    Path("fixed.yaml").write_text("model: lag.py:model\nfixed: {gain: 2.5}\n")
+    table = pd.DataFrame({"t": 0.01 * np.arange(50), "u": np.ones(50), "y": np.linspace(0, 3, 50)})
+    own = replay(table, model="lag.py:model")
+    assert own.title == "lag at its own values"
+    given = replay(table, config="fixed.yaml")
+    assert given.title == "lag with values of fixed.yaml"
+    assert given.simulated[-1] == pytest.approx(1.25 * own.simulated[-1])
