@@ -8,7 +8,9 @@ from pathlib import Path
 from daq.errors import ConfigError, RunError
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
+def write_whole(
+    path: Path, content: str | bytes, cure: str = "name another place, or make room there"
+) -> None:
     """Replace a file's content in one step. Raises RunError when the disk refuses."""
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -20,7 +22,6 @@ def write_whole(path: Path, content: str | bytes) -> None:
         reason = error.strerror
         if not path.parent.is_dir():
             reason = f"there is no folder {path.parent}, make it first"
-        cure = "name another place, or make room there"
         raise RunError(f"cannot be written: {reason}", cure=cure, file=path) from None
 
 

@@ -44,9 +44,11 @@ def draw_comparison(
     kind = style.format_of(path)
     figure = history(_overlays(root, entries, watch), _trends(entries, names))
     try:
-        write_whole(path, style.render(figure, kind))
+        write_whole(
+            path, style.render(figure, kind), "or choose another place with --plot FILE.png"
+        )
     except RunError as error:
-        raise ConfigError(str(error), cure="or choose another place with --plot FILE.png") from None
+        raise ConfigError(str(error)) from None
 
 
 def _overlays(root: Path, entries: Sequence[RunEntry], watch: Watch) -> list[Overlay]:

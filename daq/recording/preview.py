@@ -261,6 +261,8 @@ def draw_preview(preview: Preview, path: Path) -> None:
             "'preview'",
         )
     try:
-        write_whole(path, style.render(figure, kind))
+        write_whole(
+            path, style.render(figure, kind), "or choose another place with --plot FILE.png"
+        )
     except RunError as error:
-        raise ConfigError(str(error), cure="or choose another place with --plot FILE.png") from None
+        raise ConfigError(str(error)) from None
