@@ -156,7 +156,8 @@ def _draw(results: Sequence[Replay], path: Path | None) -> Path | None:
         draw_replay(results, chosen)
     except RunError as error:
         if path is not None:
-            raise ConfigError(str(error), cure="or choose another with --figure FILE.png") from None
+            problem, cure = error.mistakes[0].problem, "choose another with --figure FILE.png"
+            raise ConfigError(problem, cure=cure, file=chosen) from None
         terminal.report("warning", str(error))
         return None
     return chosen
