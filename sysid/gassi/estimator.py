@@ -536,6 +536,17 @@ class GASSI(RecordEstimator):
         """
         return self._fitted_objective(X, y, records).free_run
 
+    def final_examined(
+        self, X: Data, y: FloatArray | None = None, records: Any = None
+    ) -> Objective:
+        """The objective of the errors that tell what is missing, as of ``final_free_run``.
+
+        A filter, which follows what it cannot foresee, hides that: its errors are asked only where
+        it averages noisy inputs.
+        """
+        final = self.final_objective if self.averaged_inputs_ else self.final_free_run
+        return final(X, y, records)
+
     def _fitted_objective(self, X: Data, y: FloatArray | None, records: Any) -> Objective:
         self._check_fitted()
         if not PRESETS[self.preset].refine:

@@ -154,7 +154,7 @@ def suspected(
     try:
         if any(p.pushed for p in uncertainty.parameters):
             # What an end of a range leaves looks like something missing.
-            freed = _freed(estimator.final_objective(list(training)), estimator.final_chromosome_)
+            freed = _freed(estimator.final_examined(list(training)), estimator.final_chromosome_)
             tested = missing_physics(*freed, uncertainty)
         else:
             missing = missing or score_tests_of(estimator, training).missing
@@ -175,9 +175,7 @@ def score_tests_of(estimator: GASSI, training: Sequence[Dataset]) -> ScoreTests:
 
     Raises ModelError for equations that cannot be added to, and a run that fails.
     """
-    averaged = estimator.averaged_inputs_
-    final = estimator.final_objective if averaged else estimator.final_free_run
-    return ScoreTests(final(list(training)), estimator.final_chromosome_)
+    return ScoreTests(estimator.final_examined(list(training)), estimator.final_chromosome_)
 
 
 def _freed(objective: Objective, chromosome: FloatArray) -> tuple[Objective, FloatArray]:

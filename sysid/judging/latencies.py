@@ -123,8 +123,7 @@ def _later(
         # What acted before a record, and may yet act at its begin, is not known.
         late = (acting_later(record, places, samples * dt) for record in training)
         records = [r.part(_CUT, r.n_samples - _CUT, r.name) for r in late]
-        of = estimator.final_objective if estimator.averaged_inputs_ else estimator.final_free_run
-        objective = of(records)
+        objective = estimator.final_examined(records)
         end = refine(objective, begin)
         return _Moved(samples * dt, objective, end.chromosome, end.rms)
 

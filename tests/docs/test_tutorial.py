@@ -64,4 +64,4 @@ def test_every_command_works_as_it_stands(tmp_path):
             printed.append(result.stdout)
     assert len(printed) >= 8 and list(tmp_path.rglob("report.html"))
     # What it says of worn brushes.
-    assert any("The model lacks friction=stribeck" in text for text in printed)
+    assert any("The model lacks a term in the sign of omega" in text for text in printed)
