@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,11 +34,12 @@ _SEARCHED = 0.25  # of a search's simulations, which a variant is given
 class Alternative:
     """A variant, or the model with a term added, that was fitted as well.
 
-    name: the option that makes a variant; of a term what it is, in words. terms: those added, none
-    of a variant. better: whether it explains training by more than its further
-    parameters would by chance, and validation no worse. fits: by output, fit [%] of the model and
-    of the variant, on validation where there is any. values: quantities that the model determines
-    and the variant has elsewhere: value of the model, of the variant, unit; the farthest first.
+    name: the option that makes a variant; of a term what it is, in words. better: whether it
+    explains training by more than its further parameters would by chance, and validation no worse.
+    estimator: fitted with it. terms: those added, none of a variant. fits: by output, fit [%] of
+    the model and of the variant, on validation where there is any. values: quantities that the
+    model determines and the variant has elsewhere: value of the model, of the variant, unit; the
+    farthest first.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Alternative:
     fits: dict[str, tuple[float, float]]
     values: dict[str, tuple[float, float, str]]
     comparison: Comparison
+    estimator: GASSI = field(repr=False)
     terms: tuple[AddedTerm, ...] = ()
 
 
@@ -86,6 +88,7 @@ def best_alternative(
         {n: (float(a), float(b)) for n, a, b in zip(names, *shares, strict=True)},
         _moved(uncertainty, estimators[name].parameters_),
         comparison,
+        estimators[name],
         suspected[name].terms,
     )
 

@@ -56,6 +56,7 @@ _STRUCTURE_UNTESTED = (
     "by more than their intervals."
 )
 _PARAMETER_PRAISE = "Nothing was found missing that would move a parameter beyond its interval."
+_OF_EQUATIONS = ("bend", "function", "disturbance")  # that equations lack something
 _SURELY = 1e-5  # probability above which a function that a fit has no use for was chance
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
@@ -214,9 +215,10 @@ def judge(
     missing = [f for f in findings or () if f.kind != "variant"]
     if alternative is not None and alternative.better and alternative.terms:
         # Other functions were asked for beside a test's guess of this one.
-        missing = [f for f in missing if f.kind not in ("bend", "function", "disturbance")]
+        missing = [f for f in missing if f.kind not in _OF_EQUATIONS]
     if any(fault.kind == "lag" for fault in doubts):
-        missing = [f for f in missing if not f.comes_late]  # the same, seen less sharply
+        # The same, seen less sharply, and what the equations would need to make up for it.
+        missing = [f for f in missing if not (f.comes_late or f.kind in _OF_EQUATIONS)]
     in_vain = None if alternative is None or alternative.better else alternative
     by_chance = list[str]()
     if in_vain is not None:

@@ -167,7 +167,32 @@ def suspected(
     )
     findings = with_latencies(findings, estimator, uncertainty, training)
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
-    return Suspicion(findings, fitted, tested.unseen)
+    return Suspicion(_beside(findings, fitted, uncertainty, training), fitted, tested.unseen)
+
+
+def _beside(
+    findings: tuple[Finding, ...],
+    fitted: Alternative | None,
+    uncertainty: Uncertainty,
+    training: Sequence[Dataset],
+) -> tuple[Finding, ...]:
+    """Findings without the faults that are gone where a better alternative was fitted.
+
+    They were tested beside a line's guess of it, of which a part may look like a channel's fault.
+    """
+    if fitted is None or not fitted.better or not any(_is_tested_again(f) for f in findings):
+        return findings
+    try:
+        left = score_tests_of(fitted.estimator, training).missing(uncertainty).findings
+    except ModelError:
+        return findings
+    there = {(finding.kind, finding.name) for finding in left}
+    return tuple(f for f in findings if not _is_tested_again(f) or (f.kind, f.name) in there)
+
+
+def _is_tested_again(finding: Finding) -> bool:
+    """Whether it is a fault that a term, or a variant, may stand for in part."""
+    return finding.kind != "variant" and finding.term is None
 
 
 def score_tests_of(estimator: GASSI, training: Sequence[Dataset]) -> ScoreTests:

@@ -80,9 +80,13 @@ _SEVERAL = ("variant", "bend", "function", "curve", "disturbance", "rest")
 _SLOW = ("delay", "filter", "lag")
 _SCALES = ("gain", "offset", "drift")  # of a channel
 _MOST = 5  # findings
+# A difference of Schwarz's criterion that is very strong evidence.
+_STRONG = 10.0
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
-_HALF = 0.5  # of the residuals' squares, which other equations at rest leave at most, to be named
+# Of the residuals' squares, which other equations at rest leave at most, to be named, and terms
+# that stand in the place of a channel's fault.
+_HALF = 0.5
 # Times an output's squares, more than which a fit leaves by nothing that is there. Where samples
 # are lost in between, whitened residuals do not tell what is slow.
 _WORSE = 2.0
@@ -193,10 +197,32 @@ class ScoreTests:
         if at_rest and tests.leads([*self._named, *changing, *self._functions], at_rest):
             tests.admit(at_rest, most=1)
             return tests.settled()  # what else is found is of the wrong equations
-        tests.admit([*self._named, *changing])
-        if not any(finding.kind == "variant" or finding.explains for finding in tests.findings):
-            tests.admit(self._functions)
+        named = [*self._named, *changing]
+        tests.admit(named)
+        if any(finding.kind == "variant" or finding.explains for finding in tests.findings):
+            return tests.settled()
+        tests.admit(self._functions)
+        begun = tests.findings[0] if tests.findings else None
+        if begun is not None and begun.kind in {suspect.kind for suspect in named}:
+            rival = self._by_equations(begun, named, uncertainty)
+            if rival.criterion < tests.criterion - _STRONG and rival.settled()[0].share > _HALF:
+                return rival.settled()
         return tests.settled()
+
+    def _by_equations(
+        self, fault: Finding, named: Sequence[Suspect], uncertainty: Uncertainty
+    ) -> "_Tests":
+        """Tests that begin with what the equations lack, for which a channel's fault may stand.
+
+        Not with a function of an input that has the fault: that stands for it.
+        """
+        tests = self._tests.of(uncertainty)
+        stands = {fault.name} if fault.of_input else set()
+        beside = [s for s in self._functions if stands.isdisjoint(term.of for term in s.terms)]
+        tests.admit(beside, most=1)
+        tests.admit(named)
+        tests.admit(self._functions)
+        return tests
 
     @cached_property
     def _functions(self) -> list[Suspect]:
@@ -254,6 +280,12 @@ class _Tests:
         gradients = [_gradient(self._local, e) for e in tests._estimates]
         tests._gradients = np.array(gradients).reshape(-1, self._local.slopes.shape[2])
         return tests
+
+    @property
+    def criterion(self) -> float:
+        """Schwarz's, of what the columns leave, by its own colour."""
+        admitted = len(self._free) - self._ends[0]
+        return self._schwarz + math.log(len(self._residual)) * admitted
 
     def feedback(self, answering: Mapping[str, float]) -> tuple[Finding, ...]:
         """The input that answers what outputs err by, where that has moved an estimate.
@@ -651,7 +683,7 @@ class _Tests:
         self._slow = True
         self._regression = self._coloured_by(residual)
         rest = self._colour_of(self._residual - self._columns @ self._regression.coefficients)
-        self._deviance = rest.deviance
+        self._deviance, self._schwarz = rest.deviance, rest.criterion
         # What a suspect explains may be slow; what it leaves is not where nothing is.
         self._slow = bool(rest.slow or self._regression.whitening.model.slow)
 

@@ -72,6 +72,7 @@ def test_it_comes_to_what_a_search_comes_to_without_one(case, searched):
         assert of(begun)[1][name] == pytest.approx((low, high), rel=0.02)
 
 
+@pytest.mark.soak
 def test_a_start_that_all_logs_speak_against_leads_to_a_search(case, searched):
     values, ends = of(case[2])
     wrong = {name: (1.2 * low, 1.2 * high) for name, (low, high) in ends.items()}
@@ -82,6 +83,7 @@ def test_a_start_that_all_logs_speak_against_leads_to_a_search(case, searched):
         assert of(begun)[0][name] == pytest.approx(value, abs=0.1 * (high - low))
 
 
+@pytest.mark.soak
 def test_a_search_begins_as_well_where_the_logs_have_led_from_a_start_that_they_speak_against(
     case, monkeypatch
 ):

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from tests.daq.support import rig
+from tests.soak import mostly_soak
 
 MODELS = """
 from sysid import Input, Output, Parameter, ProcessModel, State
@@ -54,7 +55,7 @@ def test_people_read_what_acts_together_and_what_to_do(folder):
     assert "measure K by other means and give it under 'fixed'." in result.stdout
 
 
-@pytest.mark.parametrize("arguments", [[], ["--identifiable"]])
+@pytest.mark.parametrize("arguments", mostly_soak([[], ["--identifiable"]]))
 def test_values_that_rest_on_assumed_ends_are_told_with_them(tmp_path, arguments):
     result = rig("models", "actuator:limits=true", *arguments, cwd=tmp_path)
     assert result.stdout.startswith("actuator:limits=true: ")

@@ -349,6 +349,7 @@ def test_the_ends_of_amplifiers_are_named_with_what_rests_on_them(command, captu
     assert "through actuator:limits=true with the parameters of limited" in replayed.stdout
 
 
+@pytest.mark.soak
 def test_starts_of_states_are_in_the_table_and_not_in_the_figure(command, captured):
     root = captured.parent
     (root / "tied.yaml").write_text(yaml.safe_dump(few_free("R_m", "alpha0", "alpha1", "A")))

@@ -79,6 +79,7 @@ def critical_stiffness(damping):
     return SampledWall(*body, 1.0 / 800.0, 1, 150.0).critical_stiffness(damping)
 
 
+@pytest.mark.soak
 def test_a_limit_ends_the_trials_that_reach_it(static):
     folder, path, tuned = static
     file = experiment(folder, path, duration=4.0)

@@ -30,6 +30,7 @@ def test_little_is_left_of_friction_and_inertia(tmp_path, kind, most):
     assert numbers["torque_left"] < most
 
 
+@pytest.mark.soak
 def test_blocks_without_commands_have_none(tmp_path):
     path = experiment(tmp_path, controller(tmp_path, "feedforward"))
     run = record(path, "moving_hand.yaml", tmp_path, options={"hand": TO_AND_FRO})

@@ -76,6 +76,7 @@ def test_it_is_a_fault_of_the_data_that_the_verdict_names():
     verdict = verdict_of(fitted(case, training, 0), training, [validation])
     assert verdict.parameters.trust == "limited"
     assert verdict.parameters.reasons[0] == fault.sentence
+    assert "The data ask for" not in " ".join(verdict.parameters.reasons), "by wrong instants"
 
 
 @pytest.mark.parametrize("noise", [0.1, 1.0, 2.0, 4.0, 8.0])
