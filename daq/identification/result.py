@@ -287,6 +287,9 @@ class Identification(Shown):
         """Whether what was found can hardly be the plant's, for all that is known of the data."""
         from sysid.judging.assessment import coloured_innovations
 
+        findings = () if self.suspicion is None else self.suspicion.findings
+        if any(finding.is_hidden and finding.counts for finding in findings):
+            return False  # no values make up for a state that the model has not
         if self.verdict.predicted.trust == "poor":
             return True
         return self.uncertainty is not None and bool(coloured_innovations(self.uncertainty).any())

@@ -56,7 +56,13 @@ _STRUCTURE_UNTESTED = (
     "by more than their intervals."
 )
 _PARAMETER_PRAISE = "Nothing was found missing that would move a parameter beyond its interval."
-_OF_EQUATIONS = ("bend", "function", "disturbance")  # that equations lack something
+_OF_EQUATIONS = (
+    "bend",
+    "function",
+    "disturbance",
+    "follower",
+    "resonance",
+)  # that equations lack something
 _SURELY = 1e-5  # probability above which a function that a fit has no use for was chance
 _ROUNDING = 2e-4  # of an output's deviation, below which errors may be those of a simulation
 
@@ -654,7 +660,7 @@ def _moving(finding: Finding) -> str:
         if abs(m.deviations) > 1.0
     ]
     chance, text = _chance(finding), description(finding)
-    says = "The data ask for " if finding.amplitude is None else ""
+    says = "The data ask for " if finding.amplitude is None or finding.is_hidden else ""
     if finding.widens:
         moved.append(f"intervals {finding.wider:.1f} times as wide")
     way = "weighed by their colour, they ask for" if finding.kind == "feedback" else "with that"
@@ -662,7 +668,7 @@ def _moving(finding: Finding) -> str:
         f"{way} {', '.join(moved)}" if moved else f"{100.0 * finding.share:.0f} % of what is left"
     )
     # A line leads nowhere that far.
-    far = finding.turned_round or finding.kind == "rest"
+    far = finding.turned_round or finding.kind in ("rest", "resonance")
     return f"{says}{text} ({chance})" + (f"; {effect}." if not far else ".")
 
 

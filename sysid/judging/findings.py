@@ -88,6 +88,11 @@ class Finding:
         return self.kind in ("delay", "filter", "lag")
 
     @property
+    def is_hidden(self) -> bool:
+        """Whether it is motion for which the model has no state."""
+        return self.kind in ("follower", "resonance")
+
+    @property
     def explains(self) -> bool:
         """Whether next to nothing is left with a channel's fault taken out."""
         return self.amplitude is not None and self.share > _NEARLY_ALL
@@ -139,6 +144,10 @@ _WORDS = {
     "channel is wrong that looks the same",
     "feedback": "{name} answers what the outputs err by, as a controller's output does, and these "
     "errors have a memory: the fit has taken part of the answer for the plant's",
+    "resonance": "something that swings with {name} at about {time}, as an inertia behind a shaft, "
+    "a belt or a coupling that gives: the model has no state for it",
+    "follower": "something that follows {name} with a time constant of about {time}, as a body "
+    "behind a viscous coupling, or a store of heat: the model has no state for it",
     "exchange": "{name} have changed places in the log",
 }
 _FAULTS = {"gain": "a wrong gain", "offset": "an offset", "drift": "a drift"}
@@ -186,7 +195,7 @@ def _name_of(finding: Finding) -> str:
             name=finding.name,
             late=late,
             amplitude=size,
-            time=sized(size, "s"),
+            time=sized(size, finding.unit, 2) if finding.is_hidden else sized(size, "s"),
             times=1.0 + size,
             unit=unit,
             instead=instead,

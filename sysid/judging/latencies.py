@@ -30,7 +30,8 @@ from sysid.uncertainty import Uncertainty
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
 
-_ALIKE = ("delay", "filter", "mean", "lag", "crosstalk")  # kinds of findings that it may be
+# Kinds of findings that it may be.
+_ALIKE = ("delay", "filter", "mean", "lag", "crosstalk", "bend", "follower", "resonance")
 _STEP, _FARTHEST = 0.25, 2.0  # samples, between times that are tried in turn, and the last of them
 # Times more that are tried, each where those before it say, and samples by which they differ.
 _CLOSER, _SAME = 3, 2e-3

@@ -42,6 +42,7 @@ from sysid.judging.findings import (
     is_of_parameters,
     moves_of,
 )
+from sysid.judging.hidden import hidden_suspects
 from sysid.judging.phrases import sized
 from sysid.judging.regression import Regressed, Regression
 from sysid.judging.suspects import (
@@ -84,9 +85,7 @@ _MOST = 5  # findings
 _STRONG = 10.0
 _MOST_SAMPLES = 10_000  # that are tested: beyond, what matters has long been significant
 _AS_MUCH = 0.95  # of what another explains, that counts as the same
-# Of the residuals' squares, which other equations at rest leave at most, to be named, and terms
-# that stand in the place of a channel's fault.
-_HALF = 0.5
+_HALF = 0.5  # of the residuals' squares, which other equations at rest leave at most, to be named
 # Times an output's squares, more than which a fit leaves by nothing that is there. Where samples
 # are lost in between, whitened residuals do not tell what is slow.
 _WORSE = 2.0
@@ -202,27 +201,41 @@ class ScoreTests:
         if any(finding.kind == "variant" or finding.explains for finding in tests.findings):
             return tests.settled()
         tests.admit(self._functions)
-        begun = tests.findings[0] if tests.findings else None
-        if begun is not None and begun.kind in {suspect.kind for suspect in named}:
-            rival = self._by_equations(begun, named, uncertainty)
-            if rival.criterion < tests.criterion - _STRONG and rival.settled()[0].share > _HALF:
-                return rival.settled()
-        return tests.settled()
+        # Beside what swings, or follows, a line's guess of it leaves what looks like anything.
+        hidden = self._beginning(self._hidden, uncertainty)
+        beside = self._in_place_of(tests.findings, named)
+        rival = min([hidden, self._beginning(beside, uncertainty)], key=lambda each: each.criterion)
+        if rival.criterion > tests.criterion - _STRONG:
+            return tests.settled()
+        if rival is not hidden:
+            rival.admit([*named, *self._functions])
+        return rival.settled()
 
-    def _by_equations(
-        self, fault: Finding, named: Sequence[Suspect], uncertainty: Uncertainty
-    ) -> "_Tests":
-        """Tests that begin with what the equations lack, for which a channel's fault may stand.
-
-        Not with a function of an input that has the fault: that stands for it.
-        """
+    def _beginning(self, suspects: Sequence[Suspect], uncertainty: Uncertainty) -> "_Tests":
+        """Tests that begin with the surest of some suspects."""
         tests = self._tests.of(uncertainty)
-        stands = {fault.name} if fault.of_input else set()
-        beside = [s for s in self._functions if stands.isdisjoint(term.of for term in s.terms)]
-        tests.admit(beside, most=1)
-        tests.admit(named)
-        tests.admit(self._functions)
+        tests.admit(suspects, most=1)
         return tests
+
+    def _in_place_of(self, findings: Sequence[Finding], named: Sequence[Suspect]) -> list[Suspect]:
+        """Functions for which a channel's fault that was found first may stand, if one was.
+
+        Not of an input that has the fault, which stand for it, nor a signal that may be anything.
+        """
+        if not findings or findings[0].kind not in {suspect.kind for suspect in named}:
+            return []
+        stands = {findings[0].name} if findings[0].of_input else set()
+        return [
+            suspect
+            for suspect in self._functions
+            if stands.isdisjoint(term.of for term in suspect.terms)
+            and suspect.kind != "disturbance"
+        ]
+
+    @cached_property
+    def _hidden(self) -> list[Suspect]:
+        """What hangs on a state, asked for only where something is left."""
+        return list(hidden_suspects(self._runs))
 
     @cached_property
     def _functions(self) -> list[Suspect]:
@@ -235,10 +248,12 @@ class ScoreTests:
 class _Tests:
     """Regression of residuals, to which suspects are admitted one after another.
 
-    Columns are (n_residuals, n_outputs, k), in parts of the outputs' scales.
+    Columns are (n_residuals, n_outputs, k), in parts of the outputs' scales. criterion: Schwarz's,
+    of what the first finding leaves.
     """
 
     findings: list[Finding]
+    criterion: float
     _ends: list[int]
     _estimates: list[Estimate]
     _gradients: FloatArray
@@ -273,6 +288,7 @@ class _Tests:
         tests = copy(self)
         tests.findings = []
         tests._ends = [self._columns.shape[2]]  # of the columns until each finding
+        tests.criterion = math.inf
         # Starts of a very long record's parts are nobody's parameters.
         names = self._local.objective.space.names
         estimates = (e for e in uncertainty.determined() if e.combination or e.name in names)
@@ -280,12 +296,6 @@ class _Tests:
         gradients = [_gradient(self._local, e) for e in tests._estimates]
         tests._gradients = np.array(gradients).reshape(-1, self._local.slopes.shape[2])
         return tests
-
-    @property
-    def criterion(self) -> float:
-        """Schwarz's, of what the columns leave, by its own colour."""
-        admitted = len(self._free) - self._ends[0]
-        return self._schwarz + math.log(len(self._residual)) * admitted
 
     def feedback(self, answering: Mapping[str, float]) -> tuple[Finding, ...]:
         """The input that answers what outputs err by, where that has moved an estimate.
@@ -449,6 +459,9 @@ class _Tests:
             self._free = np.concatenate([self._free, np.zeros(admitted.shape[2])])
             self._ends.append(len(self._free))
             self._recolour(residual)
+            if len(self.findings) == 1:
+                amplitudes = self._ends[1] - self._ends[0]
+                self.criterion = self._schwarz + math.log(len(self._residual)) * amplitudes
             left = [i for i in left if i != surest and not suspects[i].same(suspects[surest])]
 
     def _lookalikes(
@@ -769,6 +782,7 @@ class _Tests:
         """Of a suspect by its test, each estimate moved as by whichever moves it farthest."""
         moved = np.array([max(each, key=abs) for each in zip(*moves, strict=True)])
         several, amplitudes = suspect.kind in _SEVERAL, result.amplitudes
+        size = float(amplitudes[0]) if suspect.size is None else suspect.size
         names = [estimate.name for estimate in self._estimates]
         if suspect.kind == "change" and suspect.name in names:
             # Whatever its mean, it is not that value at either end of a record.
@@ -781,7 +795,7 @@ class _Tests:
             suspect.kind,
             suspect.name,
             suspect.unit,
-            None if several else float(amplitudes[0]),
+            None if several else size,
             float(np.exp(min(log_p, 0.0))),
             result.share,
             tuple(moves_to),

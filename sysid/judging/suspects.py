@@ -38,6 +38,8 @@ Kind = Literal[
     "crosstalk",
     "noise",
     "change",
+    "follower",
+    "resonance",
     "bend",
     "function",
     "curve",
@@ -94,7 +96,7 @@ class Suspect:
     it: where outputs jump that by a little is no guide. of_input: whether a channel is an input.
     mean: of an output that comes late, what it is as a mean over the time since the sample before.
     closer: the same of sizes beside its own, where those that are tested are far apart. most: size
-    of an amplitude from which it is something else.
+    of an amplitude from which it is something else. size: of what no amplitude tells, in the unit.
     """
 
     kind: Kind
@@ -107,12 +109,14 @@ class Suspect:
     mean: Callable[[], "Suspect"] | None = None
     closer: Callable[[], "Sequence[Suspect]"] | None = None
     most: float = math.inf
+    size: float | None = None
 
     @property
     def one_sided(self) -> bool:
         """Whether only amplitudes above zero make sense: friction never drives."""
         rubs = any(term.shape == "stribeck" for term in self.terms)
-        return rubs or self.kind in ("variant", "saturation", "filter", "lag", "play", "noise")
+        one_sided = "variant", "saturation", "filter", "lag", "play", "noise", "follower"
+        return rubs or self.kind in one_sided
 
     @property
     def repeats(self) -> bool:
@@ -133,8 +137,9 @@ class Suspect:
         return bool(self.terms) and bool(suspect.terms) and len(places) == 1
 
     def same(self, suspect: "Suspect") -> bool:
-        """Whether it is a delay of the same channel, of another size."""
-        return self.late is not None and (self.kind, self.name) == (suspect.kind, suspect.name)
+        """Whether it is of the same channel or state, and of another delay, period or time."""
+        sized = self.late is not None or self.size is not None
+        return sized and (self.kind, self.name) == (suspect.kind, suspect.name)
 
 
 def channel_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:

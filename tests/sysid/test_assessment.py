@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid import Dataset, Input, Output, Parameter, ProcessModel, State
+from sysid.gassi import GASSI
 from sysid.judging.alternatives import Alternative
 from sysid.judging.assessment import examine, judge
 from sysid.judging.comparison import Comparison
@@ -409,9 +410,8 @@ def test_what_is_missing_counts_by_how_far_it_moves_parameters():
     variant = finding("variant", 2.5, "friction=stribeck")
     assert found([variant]).trust == "good"
     comparison = Comparison((), "", True, 1, 1.0)
-    fitted = Alternative(
-        variant.name, True, {"speed": (74.0, 82.0)}, {"K_m": (0.124, 0.14, "V")}, comparison
-    )
+    fits, moved = {"speed": (74.0, 82.0)}, {"K_m": (0.124, 0.14, "V")}
+    fitted = Alternative(variant.name, True, fits, moved, comparison, GASSI(MODEL))
     assert found([variant], fitted).parameters.reasons == (
         "The model lacks friction=stribeck; fitted with it: speed 74 -> 82 %, K_m 0.124 -> 0.14 V.",
     )
