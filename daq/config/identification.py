@@ -409,6 +409,12 @@ class IdentificationConfig(Signals):
         description="by how much channels of the logs come late",
         examples=[{"torque": "3 ms"}],
     )
+    filtered: dict[str, Annotated[Seconds, Field(gt=0.0)]] = Field(
+        default_factory=dict,
+        description="time constants of filters of first order through which channels of the logs "
+        "went, as a drive's; they are taken out",
+        examples=[{"omega": "8 ms"}],
+    )
     noise: dict[str, Annotated[Quantity, Field(gt=0.0, allow_inf_nan=False)]] = Field(
         default_factory=dict,
         description="standard deviations of the white noise with which inputs and outputs were "

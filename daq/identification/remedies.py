@@ -112,8 +112,12 @@ def _as_logged(settings: IdentificationConfig, finding: Finding) -> Iterator[tup
     name, amplitude = finding.name, finding.amplitude
     if amplitude is None:
         return
-    if finding.kind in ("delay", "filter") and finding.counts:
-        late = settings.delay.get(name, 0.0) + amplitude
+    taken_out = {"delay": ("delay", settings.delay), "filter": ("filtered", settings.filtered)}
+    if finding.kind in taken_out and finding.counts:
+        key, times = taken_out[finding.kind]
+        yield f"{key}.{name}", shortest(float(f"{times.get(name, 0.0) + amplitude:.3g}"))
+    if finding.late and finding.counts:
+        late = settings.delay.get(name, 0.0) + finding.late
         yield f"delay.{name}", shortest(float(f"{late:.3g}"))
     if finding.kind == "mean" and finding.counts:
         yield f"averaged.{name}", shortest(float(f"{amplitude:.6g}"))

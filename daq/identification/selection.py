@@ -48,7 +48,9 @@ class Selection:
     @classmethod
     def under(cls, settings: IdentificationConfig, file: YamlFile | None = None) -> Selection:
         """From settings, and the file that they stand in."""
-        preparation = Preparation(settings.delay, settings.detrend, settings.decimate)
+        preparation = Preparation(
+            settings.delay, settings.detrend, settings.decimate, settings.filtered
+        )
         return cls(
             settings.use,
             settings.run_in,
@@ -71,6 +73,7 @@ class Selection:
         named = {
             "noise": (self.noise, channels, "channel"),
             "averaged": (self.averaged, outputs, "output"),
+            "filtered": (self.preparation.filtered, channels, "channel"),
             "delay": (self.preparation.delay, channels, "channel"),
             "detrend": (self.preparation.detrend, channels, "channel"),
         }
@@ -123,7 +126,7 @@ class Selection:
         return replace(record, windows=windows)
 
     def prepared(self, record: Dataset, path: Path, model: ProcessModel) -> Prepared:
-        """A record as ``delay``, ``detrend`` and ``decimate`` have it; ConfigError."""
+        """A record unfiltered, in time, without trend, decimated, as asked for; ConfigError."""
         try:
             return prepare(model, record, self.preparation)
         except PreparationError as error:
@@ -198,7 +201,10 @@ def _names(path: Path) -> Sequence[str]:
     return [path.name, path.stem, str(path)]
 
 
-KEYS = ("use", "merge", "noise", "averaged", "delay", "detrend", "decimate", "run_in", "robust")
+KEYS = (
+    "use", "merge", "noise", "averaged", "filtered", "delay", "detrend", "decimate", "run_in",
+    "robust",
+)  # fmt: skip
 
 EVERYTHING = Selection()
 """All rows of every log, as they were measured."""

@@ -16,6 +16,7 @@ from sysid.judging.alternatives import Alternative, best_alternative, moved_by_n
 from sysid.judging.assessment import RecordResult, Verdict, examine, judge
 from sysid.judging.exchanges import exchanged_channels
 from sysid.judging.expected_errors import expected_errors
+from sysid.judging.filter_times import with_filter_times
 from sysid.judging.findings import Finding, Missing, Unseen
 from sysid.judging.lags import lag_faults
 from sysid.judging.latencies import with_latencies
@@ -166,6 +167,7 @@ def suspected(
         for f in tested.findings
     )
     findings = with_latencies(findings, estimator, uncertainty, training)
+    findings = with_filter_times(findings, estimator, uncertainty, training)
     fitted = best_alternative(findings, estimator, uncertainty, training, validation)
     return Suspicion(_beside(findings, fitted, uncertainty, training), fitted, tested.unseen)
 

@@ -50,7 +50,8 @@ class Finding:
     an input. p_value: by chance, all tests counted. share: of the whitened residuals' squares that
     it explains. moves: the farthest first. wider: how many times as wide the interval is that it
     widens most. alike: channels, of which the same fault would look the same in these data;
-    instead: other faults that explain nearly as much.
+    instead: other faults that explain nearly as much. late: of a filter, by how much it is late
+    beside its time [s].
     """
 
     kind: Kind
@@ -66,6 +67,7 @@ class Finding:
     rivals: tuple[AddedTerm, ...] = ()
     alike: tuple[str, ...] = ()
     instead: tuple["Finding", ...] = ()
+    late: float = 0.0
 
     @property
     def farthest(self) -> float:
@@ -190,6 +192,7 @@ def _name_of(finding: Finding) -> str:
     instead = ", or something not measured acts like it" if finding.of_input else ""
     text = _WORDS[finding.kind]
     size = abs(amplitude) if finding.kind == "delay" else amplitude
+    beside = f", and {sized(finding.late, 's')} late" if finding.late else ""
     return (
         text.format(
             name=finding.name,
@@ -202,6 +205,7 @@ def _name_of(finding: Finding) -> str:
         )
         .replace("  ", " ")
         .strip()
+        + beside
     )
 
 

@@ -1,10 +1,10 @@
-"""Preparing a record: channels that come late, offsets and drifts, more samples than are needed."""
+"""Preparing a record: filtered and late channels, offsets and drifts, more samples than needed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import ceil
+from math import ceil, exp
 from typing import Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ from sysid.problem.model import Input, ModelError, Output, ProcessModel
 _STOPPED = 60.0  # dB by which the filter stops what would fold into its passband
 _PASSED = 0.75  # of the new Nyquist frequency, up to which nothing that was above is left
 _WHOLE = 0.01  # of a sample that a delay may be off a whole number of them
+_LONGEST = 0.1  # of a record, for a filter that is taken out
 _KNOWN = 0.9  # of the filter's weight that must lie on samples that were measured
 
 
@@ -33,7 +34,8 @@ class Preparation:
 
     delay: seconds by which a channel comes late. detrend: what is taken off a channel, its mean
     (``constant``) or a straight line (``linear``). decimate: samples of which one is left, behind
-    a low-pass of linear phase that all channels share.
+    a low-pass of linear phase that all channels share. filtered: time constants [s] of filters of
+    first order through which channels were logged, taken out before all else.
 
     >>> Preparation(decimate=10).needed
     True
@@ -42,11 +44,12 @@ class Preparation:
     delay: Mapping[str, float] = field(default_factory=dict)
     detrend: Mapping[str, Literal["constant", "linear"]] = field(default_factory=dict)
     decimate: int = 1
+    filtered: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def needed(self) -> bool:
         """Whether anything is to be done."""
-        return bool(self.delay or self.detrend or self.decimate > 1)
+        return bool(self.filtered or self.delay or self.detrend or self.decimate > 1)
 
 
 AS_IT_IS = Preparation()
@@ -63,7 +66,7 @@ class Prepared:
 
 
 def prepare(model: ProcessModel, record: Dataset, preparation: Preparation) -> Prepared:
-    """A record with each channel in time, without trend, at the rate that is wanted.
+    """A record with each channel unfiltered, in time, without trend, at the rate that is wanted.
 
     Names that are none of the model's channels are passed over. Raises PreparationError for a
     record that is too short.
@@ -75,9 +78,53 @@ def prepare(model: ProcessModel, record: Dataset, preparation: Preparation) -> P
     (200, 0.01, 35, 0.04)
     """
     made = Prepared(record, 0.0, ())
-    for step in (_in_time, _detrended, _decimated):
+    for step in (_unfiltered, _in_time, _detrended, _decimated):
         made = step(model, made, preparation)
     return made
+
+
+def _unfiltered(model: ProcessModel, before: Prepared, preparation: Preparation) -> Prepared:
+    """Channels as they were before a filter of first order, as drives and meters compute it.
+
+    Of y_k = a y_(k-1) + (1 - a) x_k with a = exp(-dt / tau), x. Noise that went through the filter
+    is white again, and larger.
+    """
+    record = before.dataset
+    names = (*model.input_names, *model.output_names)
+    given = {name: tau for name, tau in preparation.filtered.items() if name in names}
+    if not given:
+        return before
+    whole = record.n_samples * record.dt
+    for name, tau in given.items():
+        if tau > _LONGEST * whole:
+            problem = f"{tau:g} s is more than a tenth of {record.name}, {whole:.3g} s"
+            raise PreparationError(("filtered", name), problem)
+    made = unfiltered(record, [given.get(name, 0.0) for name in names])
+    words = [f"{name} {1e3 * tau:.4g} ms" for name, tau in given.items()]
+    return replace(before, dataset=made, steps=(*before.steps, f"unfiltered: {', '.join(words)}"))
+
+
+def unfiltered(record: Dataset, times: Sequence[float]) -> Dataset:
+    """A record without filters of first order; times: of each input, then output, 0 for none.
+
+    >>> record = Dataset(np.zeros(3), np.array([0.0, 0.5, 0.75]), 1.0)
+    >>> unfiltered(record, [0.0, 1.0 / np.log(2.0)]).outputs[:, 0].round(9).tolist()
+    [0.0, 1.0, 1.0]
+    """
+    poles = np.array([exp(-record.dt / time) if time > 0.0 else 0.0 for time in times])
+    channels = np.column_stack((record.inputs, record.outputs))
+    for k in np.flatnonzero(poles):  # a sample that was not measured is lost in these alone
+        channels[1:, k] = (channels[1:, k] - poles[k] * channels[:-1, k]) / (1.0 - poles[k])
+    noise = np.append(record.input_noise, record.output_noise)
+    noise = noise * np.sqrt((1.0 + poles) / (1.0 - poles))
+    n = record.inputs.shape[1]
+    return replace(
+        record,
+        inputs=channels[:, :n],
+        outputs=channels[:, n:],
+        input_noise=noise[:n],
+        output_noise=noise[n:],
+    )
 
 
 def _in_time(model: ProcessModel, before: Prepared, preparation: Preparation) -> Prepared:

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from scipy.signal import lfilter
 
 from daq import ConfigError
 from daq.files import digest
@@ -126,6 +127,25 @@ def test_white_noise_is_known_behind_the_filter():
     assert made.output_noise[0] == pytest.approx(np.std(made.outputs), rel=0.05)
 
 
+@pytest.mark.parametrize("time", [3e-3, 40e-3, 1e-5])
+def test_a_filter_is_taken_out_and_its_noise_is_white_as_before(time):
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal((2, 20_000))
+    y[50] = np.nan
+    pole = np.exp(-1e-2 / time)
+    passed = lfilter([1.0 - pole], [1.0, -pole], u)  # from rest
+    noise = {"input_noise": np.array([passed.std()]), "output_noise": np.array([0.3])}
+    record = Dataset(passed, y, 0.01, **noise)
+    made = prepare(lag(), record, Preparation(filtered={"u": time, "nobody": 1.0}))
+    np.testing.assert_allclose(made.dataset.inputs[1:, 0], u[1:], atol=1e-9)
+    np.testing.assert_array_equal(made.dataset.outputs[:, 0], y)
+    assert made.dataset.input_noise == pytest.approx([1.0], rel=0.1)
+    assert made.dataset.output_noise == [0.3]
+    assert made.steps == (f"unfiltered: u {1e3 * time:.4g} ms",)
+    gaps = prepare(lag(), record, Preparation(filtered={"y": 3e-3})).dataset.outputs[:, 0]
+    assert np.flatnonzero(np.isnan(gaps)).tolist() == [50, 51]
+
+
 @pytest.fixture
 def folder(tmp_path):
     """A log whose force stands in a file of its own, faster, later, and with an offset."""
@@ -195,6 +215,9 @@ def test_a_long_log_is_searched_by_parts_and_that_is_told(folder):
     ("changes", "told"),
     [
         ({"delay": {"z": 0.1}}, "delay.z: the model has no such channel"),
+        ({"filtered": {"z": 0.1}}, "filtered.z: the model has no such channel"),
+        ({"filtered": {"y": "-3 ms"}}, "filtered.y"),
+        ({"merge": "*_force.csv", "filtered": {"y": "9 s"}}, "9 s is more than a tenth of"),
         ({"detrend": {"y": "quadratic"}}, "detrend.y"),
         ({"decimate": 0}, "decimate"),
         ({"merge": "*_force.csv", "decimate": 900}, "needs at least"),

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,13 @@ def test_a_delay_is_added_to_what_is_taken_out_already():
     late = [found("delay", "u", -0.002)]
     assert mended(late, delay={"u": "5 ms"}) == ("delay.u=0.003",)
     assert mended([found("mean", "y", 0.002)]) == ("averaged.y=0.002",)
+
+
+def test_a_filter_is_taken_out_with_what_it_is_late_beside_that():
+    assert mended([found("filter", "u", 0.003)]) == ("filtered.u=0.003",)
+    analog = [replace(found("filter", "y", 0.003), late=4.7e-4)]
+    more = mended(analog, filtered={"y": "1 ms"}, delay={"y": "1 ms"})
+    assert more == ("filtered.y=0.004", "delay.y=0.00147")
 
 
 def test_a_value_fixed_wrong_is_freed():
