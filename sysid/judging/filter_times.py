@@ -76,8 +76,8 @@ def with_filter_times(
     parameters = dict(zip(estimator.space_.names, fit.chromosome.tolist(), strict=True))
     estimates = [e for e in shared(uncertainty, parameters) if is_of_parameters(e, model)]
     moves = moves_of(estimates, [e.at(parameters) - e.value for e in estimates])
-    told = replace(first, amplitude=fit.time, late=fit.late, moves=moves)
-    return (*findings[:place], told)  # what a line's guess of it leaves looks like much else
+    fitted = replace(first, amplitude=fit.time, late=fit.late, moves=moves)
+    return (*findings[:place], fitted)  # what a line's guess of it leaves looks like much else
 
 
 def _likeliest(

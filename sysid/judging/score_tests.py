@@ -99,7 +99,6 @@ _TIMES = (0.5, 2.5, 21)  # delays that are tried, in parts of what a small one t
 _EMPTIED = 3.0
 _EXACT = 1e-3  # share by which a gain may be off: an angle of many turns may tell far less
 _LEAST = 1e-6  # error of an output in parts of the largest, below which it weighs no more
-_CLOSER_TIMES = np.linspace(-0.09, 0.09, 10)  # of the same, between those that are tried
 _FLAT = 0.999  # of what the best size of a delay explains, that is as good
 _WHOLE = 0.2  # share by which a mean may seem to be longer or shorter than it is
 _NEARLY = 0.3  # of what the likeliest shape of a function explains, that a fit may turn round
@@ -619,31 +618,29 @@ class _Tests:
     def _as_late(
         self, suspect: Suspect, result: Regressed, residual: FloatArray
     ) -> tuple[FloatArray, Regressed, FloatArray]:
-        """Changes, test and what is left of a delay as large as explains most of the residuals."""
-        regression, small = self._coloured_by(residual), float(result.amplitudes[0])
-        sizes = self._of_sizes(regression, suspect, (small * np.linspace(*_TIMES)).tolist())
-        if not sizes:
-            return suspect.changes / self._scales[..., None], result, residual
-        closer = _likeliest_size(sizes)[0] + small * _CLOSER_TIMES
-        sizes += self._of_sizes(regression, suspect, closer.tolist())
-        delay, changes, test = _likeliest_size(sizes)
-        left = self._left(changes, test)
-        # By the second, so that the amplitude is the delay.
-        changes = changes * test.amplitudes / delay
-        return changes, replace(test, amplitudes=np.array([delay])), left
+        """Changes, test and what is left of a delay as large as explains most of the residuals.
 
-    def _of_sizes(
-        self, regression: Regression, suspect: Suspect, delays: Sequence[float]
-    ) -> list[tuple[float, FloatArray, Regressed]]:
-        """Delays of a suspect with the changes that they make and their tests."""
+        Of sizes that explain about as much that of which no more and no less than all is there.
+        """
         assert suspect.late is not None
+        regression = self._coloured_by(residual)
+        delays = (float(result.amplitudes[0]) * np.linspace(*_TIMES)).tolist()
         late = [suspect.late(delay) / self._scales[..., None] for delay in delays]
         tests = self._workers.results(lambda each: regression.test(each, suspect.one_sided), late)
-        return [
+        sizes = [
             (delay, changes, test)
             for delay, changes, test in zip(delays, late, tests, strict=True)
             if test is not None
         ]
+        if not sizes:
+            return suspect.changes / self._scales[..., None], result, residual
+        enough = _FLAT * max(test.share for _, _, test in sizes)
+        alike = [each for each in sizes if each[2].share >= enough]
+        delay, changes, test = min(alike, key=lambda each: abs(float(each[2].amplitudes[0]) - 1.0))
+        left = self._left(changes, test)
+        # By the second, so that the amplitude is the delay.
+        changes = changes * test.amplitudes / delay
+        return changes, replace(test, amplitudes=np.array([delay])), left
 
     def _as_mean(
         self, suspect: Suspect, changes: FloatArray, result: Regressed, residual: FloatArray
@@ -811,15 +808,6 @@ class _Tests:
         low, high = self._limits.get(move.quantity.name, (-np.inf, np.inf))
         value = move.quantity.value
         return replace(move, change=float(np.clip(move.change, low - value, high - value)))
-
-
-def _likeliest_size(
-    sizes: Sequence[tuple[float, FloatArray, Regressed]],
-) -> tuple[float, FloatArray, Regressed]:
-    """Of sizes that explain about as much that of which no more and no less than all is there."""
-    enough = _FLAT * max(test.share for _, _, test in sizes)
-    alike = [each for each in sizes if each[2].share >= enough]
-    return min(alike, key=lambda each: abs(float(each[2].amplitudes[0]) - 1.0))
 
 
 def _fixed(objective: Objective) -> list[str]:
