@@ -20,6 +20,7 @@ from sysid.judging.filter_times import with_filter_times
 from sysid.judging.findings import Finding, Missing, Unseen
 from sysid.judging.lags import lag_faults
 from sysid.judging.latencies import with_latencies
+from sysid.judging.mistaken_units import output_in_another_unit
 from sysid.judging.score_tests import ScoreTests, missing_physics
 from sysid.judging.starts import estimated_starts
 from sysid.problem.data import Dataset
@@ -150,6 +151,9 @@ def suspected(
     exchange = exchanged_channels(estimator, uncertainty, training, runs)
     if exchange is not None:
         return Suspicion((exchange,), None)  # what else is found is of the wrong channels
+    units = output_in_another_unit(estimator, uncertainty, training)
+    if units:
+        return Suspicion(units, None)
     if estimator.averaged_inputs_ and np.any(uncertainty.bent > MISJUDGED):
         return None
     try:

@@ -14,15 +14,14 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.special import chdtrc
 
 from sysid.arrays import FloatArray
-from sysid.judging.evidence import independent_samples
-from sysid.judging.findings import Finding, moves_of
+from sysid.judging.findings import Finding
+from sysid.judging.mended_data import explained_mended
 from sysid.judging.residual_tests import residual_test
 from sysid.problem.data import Dataset
 from sysid.problem.metrics import fit_percent
-from sysid.problem.model import Input, ModelError, Output
+from sysid.problem.model import Input, Output
 from sysid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
 _WHITE = 0.75  # share of autocorrelations inside their band, above which nothing is left
 _ALIKE = 0.5  # correlation of two outputs, below which a model that took one for the other fails
 _POOR = 50.0  # fit [%] below which channels that are not alike may have been exchanged
-_LESS = 0.5  # of the residuals' squares, that data the right way round leave
-_SURE = 1e-4  # probability by chance
 
 Side = Literal["inputs", "outputs"]
 
@@ -86,32 +83,17 @@ def _tested(
     names: tuple[str, str],
 ) -> Finding | None:
     """The finding of an exchange; None where it does not explain the records much better."""
-    from sysid.gassi import GASSI
+    side, *pair = channels
+    mended = [_with_exchanged(record, *channels) for record in training]
 
-    records = [_with_exchanged(record, *channels) for record in training]
-    # Compared is what free runs leave of all outputs together, which that criterion makes least.
-    settings = estimator.get_params(deep=False)
-    settings |= {"criterion": "likelihood", "process_noise": None}
-    try:
-        fitted = GASSI(**settings).fit(records)
-        anew = [record.outputs - fitted.predict(record) for record in records]
-    except ModelError:
+    def as_logged(residual: FloatArray) -> FloatArray:
+        return _exchanged(residual, *pair) if side == "outputs" else residual
+
+    explained = explained_mended(estimator, uncertainty, left, mended, as_logged)
+    if explained is None:
         return None
-    if channels[0] == "outputs":  # in the order of the log
-        anew = [_exchanged(residual, *channels[1:]) for residual in anew]
-    rest = np.concatenate(anew)
-    seen = np.isfinite(rest).all(axis=1) & np.isfinite(np.concatenate(left)).all(axis=1)
-    before, after = (np.sum(np.concatenate(e)[seen] ** 2, axis=0) for e in (left, anew))
-    if not seen.any() or not np.all(before > 0.0):
-        return None
-    share = float(np.exp(np.mean(np.log(np.maximum(after, 1e-300) / before))))
-    samples = independent_samples([rest[seen]])
-    p_value = float(chdtrc(1, max(-samples * len(before) * np.log(share), 0.0)))
-    if share > _LESS or p_value > _SURE:
-        return None
-    determined = uncertainty.determined()
-    moves = moves_of(determined, [e.at(fitted.parameters_) - e.value for e in determined])
-    return Finding("exchange", " and ".join(names), "", 1.0, p_value, 1.0 - share, moves)
+    share, chance, moves = explained.share, explained.p_value, explained.moves
+    return Finding("exchange", " and ".join(names), "", 1.0, chance, share, moves)
 
 
 def _signals(estimator: GASSI, side: Side) -> Sequence[Input | Output]:

@@ -184,9 +184,10 @@ def _name_of(finding: Finding) -> str:
         change = f"{100.0 * amplitude:+.{0 if abs(amplitude) >= 0.01 else 2}f} % of its value"
         return f"{finding.name} changes by {change} from a record's first to last sample"
     if finding.kind == "gain":
-        times = f"is {1.0 + amplitude:.3g} times what"
-        is_what = "has the opposite sign of what" if finding.turned_round else times
-        return f"{finding.name} {is_what} the model has"
+        as_in = f", as in {unit}" if unit else ""
+        times = f"is {1.0 + amplitude:.3g} times what the model has{as_in}"
+        opposite = "has the opposite sign of what the model has"
+        return f"{finding.name} {opposite if finding.turned_round else times}"
     early = "early, or acts so much later" if finding.of_input else "early, or its inputs so late"
     late = "late" if amplitude > 0.0 else early
     instead = ", or something not measured acts like it" if finding.of_input else ""
