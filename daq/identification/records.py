@@ -35,6 +35,8 @@ from sysid.problem.model import ModelError, ProcessModel
 if TYPE_CHECKING:
     import pandas as pd
 
+_LARGEST = 1e100  # of a sample: far beyond, squares are infinite
+
 
 @dataclass(frozen=True)
 class Preparation:
@@ -393,6 +395,7 @@ def _from_log(
             section = "Name the column in the 'columns' section of a file given with --config"
             cure = f"{suggestion(name, list(columns))} {section}"
             raise ConfigError(problem, cure=cure, file=log.path)
+        _refuse_absurd(log.path, columns["t"], name, columns[name])
     inputs, outputs = (
         np.reshape([columns[name] for name in names], (len(names), -1)).T.astype(np.float64)
         for names in (model.input_names, model.output_names)
@@ -412,6 +415,16 @@ def _from_log(
         colour[places] = np.where(speed, speeds.colour[rows][:, None], 0.0)
         dataset = replace(dataset, windows=windows, jitter=jitter, jitter_colour=colour)
     return dataset
+
+
+def _refuse_absurd(path: Path, time: FloatArray, name: str, values: FloatArray) -> None:
+    """Raise ConfigError at the first sample whose square is no number, if any."""
+    absurd = np.abs(values) > _LARGEST
+    if absurd.any():
+        at = int(np.argmax(absurd))
+        problem = f"at t = {time[at]:g} s it is {values[at]:.3g}, which nothing measures"
+        cure = "mend it, or cut it out, as by 'use: 0 s .. 1 s'"
+        raise ConfigError(problem, cure=cure, file=path, key=name)
 
 
 def _without_run_in(

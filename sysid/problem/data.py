@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sysid.arrays import BoolArray, FloatArray
+from sysid.arrays import FloatArray
 from sysid.problem.channels import noise
 from sysid.problem.model import AROUND_FIRST_SAMPLE, ModelError, ProcessModel
 
+_LARGEST = 1e100  # of a sample: far beyond, squares are infinite
 _SAME_RATE = 1e-3  # of a sample time
 
 
@@ -40,7 +41,7 @@ class Dataset:
     to have been planned, so that none of them answers an output.
 
     Raises ModelError for mismatched shapes, fewer than two rows, complex numbers, inputs that are
-    not finite, or infinite outputs.
+    not finite, infinite outputs, or numbers beyond 1e100.
 
     >>> record = Dataset(inputs=np.ones(5), outputs=np.arange(5.0), dt=0.01, name="ramp")
     >>> record.n_samples, record.outputs.shape
@@ -82,8 +83,9 @@ class Dataset:
             raise ModelError(f"{self.name}: it has {len(self.outputs)} row(s); at least 2 needed")
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise ModelError(f"{self.name}: sample time {self.dt} s must be positive")
-        self._refuse(~np.isfinite(self.inputs), "input", "mend it, or cut the record there")
-        self._refuse(np.isinf(self.outputs), "output", "write NaN for a sample that was lost")
+        self._refuse(self.inputs, "input", "mend it, or cut the record there")
+        measured = np.nan_to_num(self.outputs, nan=0.0, posinf=np.inf, neginf=-np.inf)
+        self._refuse(measured, "output", "write NaN for a sample that was lost")
         for name in ("input_zero", "output_zero", "input_noise", "output_noise"):
             object.__setattr__(self, name, self._deviations(name))
         self._check_windows()
@@ -145,12 +147,14 @@ class Dataset:
             raise ModelError(f"{self.name}: {name} have shape {table.shape}; give (n_samples, n)")
         return table.reshape(-1, 1) if table.ndim == 1 else table
 
-    def _refuse(self, wrong: BoolArray, kind: str, cure: str) -> None:
-        """Raise ModelError at the first wrong entry of a table, if any."""
+    def _refuse(self, table: FloatArray, kind: str, cure: str) -> None:
+        """Raise ModelError at the first entry of a table that is no measurement, if any."""
+        wrong = ~(np.abs(table) <= _LARGEST)
         if wrong.any():
             row, column = np.argwhere(wrong)[0].tolist()
+            what = "beyond 1e100" if np.isfinite(table[row, column]) else "not finite"
             raise ModelError(
-                f"{self.name}: {kind} {column} is not finite in row {row}, counted from 0; {cure}"
+                f"{self.name}: {kind} {column} is {what} in row {row}, counted from 0; {cure}"
             )
 
     def _deviations(self, name: str) -> FloatArray:

@@ -23,6 +23,7 @@ def test_columns_may_be_vectors():
         (np.zeros(3), np.zeros(3), np.nan, "must be positive"),
         (np.array([0.0, np.nan, 0.0]), np.zeros(3), 0.1, "input 0 is not finite in row 1"),
         (np.zeros(3), np.array([0.0, 0.0, -np.inf]), 0.1, "output 0 is not finite in row 2.* NaN"),
+        (np.zeros(3), np.array([0.0, -1e200, 0.0]), 0.1, "output 0 is beyond 1e100 in row 1"),
         (np.zeros(3) + 1j, np.zeros(3), 0.1, "inputs are complex; give real numbers"),
         (np.zeros(3), np.zeros(3) + 1j, 0.1, "outputs are complex; give real numbers"),
         (np.array(["0", "x", "1"]), np.zeros(3), 0.1, "inputs are not numbers: .*'x'"),
