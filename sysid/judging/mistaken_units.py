@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sysid.gassi import GASSI
 
 _POOR = 70.0  # fit [%] of an output below which its unit may be another
+_ALL = 0.9  # of the residuals' squares that the right one explains at least
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ _TAKEN_FOR = {
 def output_in_another_unit(
     estimator: GASSI, uncertainty: Uncertainty, training: Sequence[Dataset]
 ) -> tuple[Finding, ...]:
-    """Gain and offset of the output whose unit is another, none where no other explains more."""
+    """Gain and offset of the output whose unit is another, none where no other explains all."""
     best = tuple[Finding, ...]()
     runs = [estimator.predict(record) for record in training]
     left = [record.outputs - run for record, run in zip(training, runs, strict=True)]
@@ -73,7 +74,8 @@ def output_in_another_unit(
             explained = explained_mended(
                 estimator, uncertainty, left, mended, partial(_as_logged, j, unit)
             )
-            if explained is not None and (not best or explained.share > best[0].share):
+            least = best[0].share if best else _ALL
+            if explained is not None and explained.share > least:
                 best = tuple(_findings(output, unit, explained))
     return best
 
