@@ -30,7 +30,7 @@ from sysid.uncertainty.sensitivity import sensitivity
 if TYPE_CHECKING:
     from sysid.gassi import GASSI
 
-_REACH = 0.5  # part by which a time may be off that slopes tell
+_REACH = 2.5  # times by which a time may be off that slopes tell
 _TOLERANCE = 2e-3  # of the time
 _MOST_SAMPLES = 20_000  # to be fitted so often
 _SURE = 10.0  # of twice the logarithm of a likelihood ratio, below which it is a drive's filter
@@ -87,12 +87,14 @@ def _likeliest(
 
     tried = list[_Unfiltered]()
 
-    def deviance(time: float) -> float:
-        tried.append(_without(estimator, training, j, float(time), is_analog))
+    def deviance(factor: float) -> float:
+        time = guess * math.exp(factor)
+        tried.append(_without(estimator, training, j, time, is_analog))
         return tried[-1].deviance
 
-    ends, tolerance = ((1.0 - _REACH) * guess, (1.0 + _REACH) * guess), _TOLERANCE * guess
-    minimize_scalar(deviance, bounds=ends, method="bounded", options={"xatol": tolerance})
+    reach = math.log(_REACH)
+    ends = (-reach, reach)
+    minimize_scalar(deviance, bounds=ends, method="bounded", options={"xatol": _TOLERANCE})
     return min(tried, key=lambda fit: fit.deviance)
 
 

@@ -5,6 +5,8 @@ import pytest
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
+from benchmarks._stress_cases import cases
+from benchmarks.stress import fitted
 from sysid import Dataset
 from sysid.gassi import GASSI
 from sysid.judging.examination import suspected, verdict_of
@@ -57,3 +59,15 @@ def test_its_time_is_told_by_fits_and_without_it_all_is_well(is_analog, time):
     found = [e for e in estimator.uncertainty(clean[0]).determined() if e.name in TRUTH]
     assert len(found) == 5
     assert sum(e.excludes(TRUTH) for e in found) <= 1
+
+
+def test_a_time_that_slopes_tell_far_too_short_is_found_all_the_same():
+    """The winding takes up most of a filter of its current: 1.7 ms had been told of 3."""
+    case = {case.name: case for case in cases()}["current through a filter"]
+    training, _ = case.records(0)
+    estimator = fitted(case, training, 0)
+    finding, *_ = suspected(estimator, estimator.uncertainty(list(training)), training).findings
+    assert (finding.kind, finding.name, finding.late) == ("filter", "current", 0.0)
+    assert finding.amplitude == pytest.approx(3e-3, rel=0.02)
+    moved = {move.quantity.name: move.quantity.value + move.change for move in finding.moves}
+    assert moved["L"] == pytest.approx(2e-3, rel=0.03)
