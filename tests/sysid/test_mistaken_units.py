@@ -34,6 +34,7 @@ def test_a_speed_in_another_unit_is_named_with_it(unit, times):
             assert right == pytest.approx(TRUTH[move.quantity.name], rel=0.05)
 
 
+@pytest.mark.soak
 def test_a_temperature_in_fahrenheit_has_another_zero_as_well():
     warm = body_log(1, 0.0)
     fahrenheit = replace(warm, outputs=1.8 * (warm.outputs + 20.0) + 32.0)
