@@ -237,7 +237,11 @@ class TermSetting(Section):
     """A function of one signal that is added to an equation, times a parameter of its own."""
 
     equation: str = Field(description="the state to whose rate it is added", examples=["omega"])
-    of: str = Field(description="the state or input that it is a function of", examples=["omega"])
+    of: str = Field(
+        description="the state or input that it is a function of, or a parameter, which changes "
+        "then with its own part of the equation: it is multiplied by 1 + the term",
+        examples=["omega"],
+    )
     shape: TermShape = Field(
         description="of z = (signal - centre) / scale: sign (in proportion where |z| < 1), linear, "
         "square (z |z|), cube, abs, parabola (z^2), sine or stribeck (sign(z) exp(-z^2))"

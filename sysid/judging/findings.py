@@ -157,7 +157,7 @@ _FAULTS = {"gain": "a wrong gain", "offset": "an offset", "drift": "a drift"}
 _SHAPES = {
     "rest": "another {name}, as behind a driver that opens between pulses: the model's equations "
     "want a case for that",
-    "bend": "a {name} that changes with the size of what it multiplies",
+    "bend": "a {name} that changes with the {by} of what it multiplies",
     "curve": "a curve between {name} and what is logged of it, as of a sensor that bends",
     "disturbance": "a slow signal in d{name}/dt that nobody measured",
 }
@@ -175,10 +175,12 @@ def _name_of(finding: Finding) -> str:
     amplitude, unit = finding.amplitude, "" if finding.unit == "1" else finding.unit
     if finding.kind == "variant":
         return finding.name
+    if finding.kind in _SHAPES:
+        squared = finding.term is not None and finding.term.shape == "parabola"
+        by = "square" if squared else "size"
+        return _SHAPES[finding.kind].format(name=finding.name, by=by)
     if finding.term is not None:
         return _term_text(finding.term)
-    if finding.kind in _SHAPES:
-        return _SHAPES[finding.kind].format(name=finding.name)
     assert amplitude is not None
     if finding.kind == "change":
         change = f"{100.0 * amplitude:+.{0 if abs(amplitude) >= 0.01 else 2}f} % of its value"

@@ -21,7 +21,7 @@ from sysid.linear.polynomials import all_pole
 from sysid.problem.channels import noise
 from sysid.problem.data import Dataset
 from sysid.problem.model import Input, ProcessModel, State
-from sysid.problem.terms import AddedTerm, Shape
+from sysid.problem.terms import AddedTerm, Shape, rate_unit
 from sysid.uncertainty.colour import record_rows
 
 Kind = Literal[
@@ -76,6 +76,7 @@ _BENDS: tuple[Callable[[FloatArray], FloatArray], ...] = (
     lambda z: z**2,
     lambda z: 1.0 / (z + 0.05),
 )
+_BENT: tuple[Shape, ...] = ("abs", "parabola")  # the first of these, as a fit takes them
 # Samples that an input stands at zero at least, and least share of records that it does or not.
 _AT_REST, _OFTEN = 5, 0.05
 _PROPORTIONAL = 1e-6  # what a term may be beside a signal that it is in proportion to
@@ -727,6 +728,8 @@ def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
     signals = np.concatenate([np.hstack([run.states, run.record.inputs]) for run in runs])
     earlier: list[FloatArray] = []
     for place, name in enumerate(model.parameter_names):
+        if model.parameters[place].minimum < 0.0:  # no stiffness, conductance, resistance
+            continue
         moved = vector.copy()
         moved[place] += PROBE * (vector[place] or 1.0)
         terms = followed(runs, moved)
@@ -744,7 +747,14 @@ def bend_suspects(runs: Sequence[DisturbedRun]) -> Iterator[Suspect]:
         earlier.append(along)
         size = float(np.abs(along).max())
         bent = [_bent(each, main, size) for each in terms]
-        yield Suspect("bend", name, "1", of_each(runs, DisturbedRun.added, bent))
+        changes = of_each(runs, DisturbedRun.added, bent)
+        yield Suspect("bend", name, "1", changes, _bends(model.states[main], name, size))
+
+
+def _bends(state: State, name: str, size: float) -> tuple[AddedTerm, ...]:
+    """Terms by which a parameter changes with its part of a state's rate, and with its square."""
+    unit, scale = rate_unit(state.unit), _short(size)
+    return tuple(AddedTerm(state.name, name, shape, scale, -1.0, 1.0, 0.0, unit) for shape in _BENT)
 
 
 def _alike(values: FloatArray, along: FloatArray) -> bool:

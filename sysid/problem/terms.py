@@ -1,4 +1,7 @@
-"""Terms added to a model's equations: functions of one signal, each with a parameter of its own."""
+"""Terms added to a model's equations, each with a parameter of its own.
+
+Functions of one signal, and parameters that change with the size of what they multiply.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,6 +15,8 @@ from sysid.problem.shapes import dry_friction
 
 Shape = Literal["sign", "linear", "square", "cube", "abs", "parabola", "sine", "stribeck"]
 
+_PROBE = 1e-3  # part of a parameter by which its part of an equation is told
+_LEAST = 1e-3  # of a parameter, to which it may change
 _STICKS = 0.01  # of a Stribeck speed, below which it grows from zero
 
 
@@ -19,11 +24,11 @@ _STICKS = 0.01  # of a Stribeck speed, below which it grows from zero
 class AddedTerm:
     """What is added to a state's rate: a parameter times a shape of z = (signal - centre) / scale.
 
-    equation: the state. of: the signal, a state or an input. shape: ``sign`` (in proportion where
-    abs(z) < 1), ``linear``, ``square`` (z abs(z)), ``cube``, ``abs``, ``parabola`` (z^2),
-    ``sine`` or ``stribeck`` (sign(z) exp(-z^2)).
-    scale, centre: in the signal's unit. low, high: range of the parameter, in the unit of the rate.
-    unit: the signal's, for sentences.
+    equation: the state. of: the signal, a state or an input. Or a parameter: of its own part of the
+    equation then, and what it is multiplied by, 1 + the term, in all equations. shape: ``sign`` (in
+    proportion where abs(z) < 1), ``linear``, ``square`` (z abs(z)), ``cube``, ``abs``, ``parabola``
+    (z^2), ``sine`` or ``stribeck`` (sign(z) exp(-z^2)). scale, centre: in the signal's unit. low,
+    high: range of the parameter, in the unit of the rate, or a number. unit: the signal's, for sentences.
 
     >>> AddedTerm("omega", of="omega", shape="sign", scale=0.05, low=-500.0, high=500.0).parameter
     'sign_of_omega'
@@ -74,13 +79,15 @@ def _with_term(model: ProcessModel, term: AddedTerm) -> ProcessModel:
     signals = (*model.state_names, *model.input_names)
     for kind, name, names in (
         ("state", term.equation, model.state_names),
-        ("state or input", term.of, signals),
+        ("state, input or parameter", term.of, (*signals, *model.parameter_names)),
     ):
         if name not in names:
             there = ", ".join(names)
             raise ModelError(f"model {model.name} has no {kind} {name!r}; it has {there}")
     if not (math.isfinite(term.scale) and term.scale > 0.0):
         raise ModelError(f"the scale of a term in {term.of} is {term.scale:g}; it must be above 0")
+    if term.of not in signals:
+        return _with_bend(model, term)
     place, n = model.state_names.index(term.equation), len(model.parameters)
     parameter = Parameter(
         term.parameter,
@@ -99,6 +106,39 @@ def _with_term(model: ProcessModel, term: AddedTerm) -> ProcessModel:
         None if output is None else lambda x, u, p: output(x, u, p[:n]),
         f"d{term.equation}/dt += {term.parameter} {_text(term)}",
         lambda variant: _with_term(variant, term),
+    )
+
+
+def _with_bend(model: ProcessModel, term: AddedTerm) -> ProcessModel:
+    """The model with a parameter that changes with the size of what it multiplies."""
+    place, n = model.state_names.index(term.equation), len(model.parameters)
+    i = model.parameter_names.index(term.of)
+    derivative, output, behind = model.derivative, model.output, i + 1
+    shape, centre, scale = _SHAPES[term.shape], term.centre, term.scale
+    parameter = Parameter(
+        term.parameter,
+        "1",
+        0.5 * (term.low + term.high),
+        term.low,
+        term.high,
+        minimum=-math.inf,
+        description=f"by which {term.of} changes: {term.shape} of its part of d{term.equation}/dt",
+    )
+
+    def rates(x: Any, u: Any, p: Any) -> tuple[Any, ...]:
+        more = derivative(x, u, (*p[:i], (1.0 + _PROBE) * p[i], *p[behind:n]))
+        part = (more[place] - derivative(x, u, p[:n])[place]) / _PROBE
+        factor = max(1.0 + p[n] * shape((part - centre) / scale), _LEAST)
+        return derivative(x, u, (*p[:i], factor * p[i], *p[behind:n]))
+
+    return extended(
+        model,
+        parameter,
+        rates,
+        None if output is None else lambda x, u, p: output(x, u, p[:n]),
+        f"{term.of} *= 1 + {term.parameter} {term.shape}(its part of d{term.equation}/dt "
+        f"/ {scale:g})",
+        lambda variant: _with_bend(variant, term),
     )
 
 

@@ -882,11 +882,11 @@ def two_masses(spring, seed=0, n=800, dt=6e-3, parts=10):
     ("spring", "words"),
     mostly_soak(
         [
-            (lambda e, t: 300.0 * e + 8e5 * e**3, "a k that changes with the size"),
+            (lambda e, t: 300.0 * e + 8e5 * e**3, "lacks a k that changes with the square"),
             (lambda e, t: 300.0 * (1.0 - 0.06 * t) * e, "k changes by -3"),
             (
                 lambda e, t: 300.0 * (e - np.clip(e, -0.002, 0.002)),
-                "a k that changes with the size",
+                "a k that changes with the s",
             ),
             (lambda e, t: 300.0 * e, ""),
         ]

@@ -45,6 +45,23 @@ def test_a_term_is_added_to_its_equation_alone(shape):
         assert rates[1] - plain[1] == pytest.approx(added, abs=1e-9 * abs(plain[1]))
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_term_of_a_parameter_multiplies_it_in_all_equations(shape):
+    """By its own part of one of them: of R, of the voltage it takes in the winding's."""
+    extended = with_terms(MODEL, [AddedTerm("current", "R", shape, 900.0, -1.0, 9.0)])
+    assert extended.parameter_names[-1] == f"{shape}_of_R_in_current"
+    assert extended.parameters[-1].unit == "1"
+    place, inductance = MODEL.parameter_names.index("R"), TRUTH["L"]
+    for x in map(tuple, POINTS.tolist()):
+        part = -TRUTH["R"] * x[0] / inductance
+        if abs(part) < 9.0:  # where a shape has a slope for a jump
+            continue
+        factor = max(1.0 + 0.7 * SHAPES[shape](part / 900.0), 1e-3)
+        values = (*VALUES[:place], factor * TRUTH["R"], *VALUES[place + 1 :])
+        rates = extended.derivative(x, (3.0, 0.01), (*VALUES, 0.7))
+        assert rates == pytest.approx(MODEL.derivative(x, (3.0, 0.01), values), rel=1e-6)
+
+
 @pytest.mark.soak
 def test_a_term_is_added_to_equations_that_nothing_can_follow():
     """NumPy's sign is compiled as it is, with what is added to the last equation behind it."""
@@ -105,7 +122,10 @@ def test_outputs_constraints_and_variants_stay_those_of_the_models_own_parameter
     ("term", "words"),
     [
         (AddedTerm("speed", "omega", "sign", 0.1, -1.0, 1.0), "no state 'speed'"),
-        (AddedTerm("omega", "speed", "sign", 0.1, -1.0, 1.0), "no state or input 'speed'"),
+        (
+            AddedTerm("omega", "speed", "sign", 0.1, -1.0, 1.0),
+            "no state, input or parameter 'speed'",
+        ),
         (AddedTerm("omega", "omega", "sign", 0.0, -1.0, 1.0), "must be above 0"),
         (AddedTerm("omega", "omega", "sign", 0.1, 1.0, -1.0), "low end at or above"),
     ],
