@@ -28,7 +28,8 @@ class AddedTerm:
     equation then, and what it is multiplied by, 1 + the term, in all equations. shape: ``sign`` (in
     proportion where abs(z) < 1), ``linear``, ``square`` (z abs(z)), ``cube``, ``abs``, ``parabola``
     (z^2), ``sine`` or ``stribeck`` (sign(z) exp(-z^2)). scale, centre: in the signal's unit. low,
-    high: range of the parameter, in the unit of the rate, or a number. unit: the signal's, for sentences.
+    high: range of the parameter, in the unit of the rate, or a number. unit: the signal's, for
+    sentences.
 
     >>> AddedTerm("omega", of="omega", shape="sign", scale=0.05, low=-500.0, high=500.0).parameter
     'sign_of_omega'
