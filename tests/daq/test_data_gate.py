@@ -354,7 +354,7 @@ def test_terms_are_added_to_a_model_and_kept_in_its_result(folder):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"of": "speed"}, r"id.yaml:\d+:\d+: terms.0: .*no state or input 'speed'"),
+        ({"of": "speed"}, r"id.yaml:\d+:\d+: terms.0: .*no state, input or parameter 'speed'"),
         ({"scale": -1.0}, r"terms.0.scale"),
         ({"shape": "wave"}, r"terms.0.shape"),
         ({"range": [3.0, 2.0]}, r"terms.0: .*low end at or above"),
