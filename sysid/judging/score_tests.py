@@ -220,7 +220,8 @@ class ScoreTests:
     def _in_place_of(self, findings: Sequence[Finding], named: Sequence[Suspect]) -> list[Suspect]:
         """Functions for which a channel's fault that was found first may stand, if one was.
 
-        Not of an input that has the fault, which stand for it, nor a signal that may be anything.
+        Not of an input that has the fault, which stand for it, nor an output's curve, which is a
+        fault as well, nor a signal that may be anything.
         """
         if not findings or findings[0].kind not in {suspect.kind for suspect in named}:
             return []
@@ -229,7 +230,7 @@ class ScoreTests:
             suspect
             for suspect in self._functions
             if stands.isdisjoint(term.of for term in suspect.terms)
-            and suspect.kind != "disturbance"
+            and suspect.kind not in ("curve", "disturbance")
         ]
 
     @cached_property
